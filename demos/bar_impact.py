@@ -74,8 +74,8 @@ def bar(dt: float, end: float, name: str, *, fall: bool = False, contactors: str
 
 
 # %% [markdown]
-# ## Flight against the wall, and what contactors with mass do
-# The plateau is what lies between the first and the last tenth of the contact: a mesh cannot show the front of the wave.
+# ## Impact on the wall, and the effect of contactors with mass
+# The plateau is the middle 80 % of the contact: a mesh cannot resolve the front of the wave.
 
 # %%
 weight, dt = rho * L * g, args.cfl * L / args.n / c

@@ -86,12 +86,12 @@ writer = uem.ResultsWriter(f"{args.output}/cattaneo_mindlin", problem) if args.o
 
 # %% [markdown]
 # ## The closed form
-# After every reversal friction changes by twice what a first loading by half as much would bring.
+# After a reversal the change of friction is twice that of a first loading by half of the amplitude.
 
 
 # %%
 def mindlin(r: np.ndarray, a: float, limit: float, last: float, Q: float) -> tuple[np.ndarray, float, float]:
-    """Friction over mu p0 at r after the push went from ``last``, where it turned or began, to Q; radius of what sticks; delta."""
+    """Friction over mu p0 at r after the push went from ``last``, where it turned or began, to Q; radius of the stick zone; delta."""
 
     def f(c: float) -> np.ndarray:
         return c / a * np.sqrt(np.maximum(1 - (r / c) ** 2, 0.0))
@@ -116,12 +116,12 @@ def mindlin(r: np.ndarray, a: float, limit: float, last: float, Q: float) -> tup
 # %%
 rows, profiles, facet = [], [], h * reach
 sticking = fem.Function(contact.status.function_space)
-# what every step asks for is compiled once
+# the forms of all steps are compiled once
 stick_area, way_area = fem.form(sticking * cap), fem.form(u[0] * top)
 
 
 def step_to(Q: float, last: float = 0.0) -> None:
-    """One step, and what it shows; contact forces push the body back."""
+    """One step and its results; contact forces push the body back."""
     push.value = Q
     (step,) = uem.load_steps(problem)
     if writer:

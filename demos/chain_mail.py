@@ -24,7 +24,7 @@ Options:
 #
 #     c (u - u_old)   per unit of volume,    c -> 0,
 #
-# which holds all links. In the end they do not move any more, and then there is no drag: what is found is an equilibrium of statics.
+# which holds all links. In the end they do not move any more, and then there is no drag: the result is a static equilibrium.
 # With friction the links do not slip where they touch.
 
 # %%

@@ -61,7 +61,7 @@ def arguments(docstring: str | None, **options: Any) -> argparse.Namespace:
     """Parse the command line.
 
     Args:
-        docstring: of the demo; ``--help`` shows its first line, and what it says of the options.
+        docstring: of the demo; ``--help`` shows its first line and its notes on the options.
         options: the demo's own options, by name: the default, or a tuple of choices whose first is the default; False makes a flag.
     """
     parser = argparse.ArgumentParser(description=(docstring or "").partition("\n")[0])
@@ -135,13 +135,13 @@ def numbers(text: str, mark: str = ",") -> list[int]:
 
 
 def outside_mpi() -> dict[str, str]:
-    """Environment for a process that is told from this one's MPI."""
+    """Environment of a process that takes no part in the MPI of this one."""
     own = ("OMPI_", "PMI", "HYD", "MPI_")
     return {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
 
 
 def free_memory() -> None:
-    """Free what Python and PETSc have let go of (collective)."""
+    """Free objects that Python and PETSc no longer use (collective)."""
     gc.collect()
     PETSc.garbage_cleanup(comm)
 

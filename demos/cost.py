@@ -46,7 +46,7 @@ args = common.arguments(
     coupling=("node_to_surface", "mortar"),
     runs=1,
 )
-#: Timers of what contact adds, and of what there is without it; some hold others.
+#: Timers of the parts due to contact, and of the others; some include others.
 CONTACT = (
     "search and projection", "uniting equations", "contact curvature", "restriction matrix P", "united matrix P'KP",
     "united matrix Q'KP", "condensed matrix", "deflation",

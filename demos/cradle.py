@@ -42,7 +42,7 @@ c = np.sqrt(E / rho)
 
 # %% [markdown]
 # ## The scene
-# The bars are named, so that a contact can be asked for the force between two of them.
+# The bars are named, so that the contact can give the force between two of them.
 
 # %%
 parameters = {"bars": args.bars, "L": L, "width": width, "gap": args.gap, "n": args.n}

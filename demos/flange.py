@@ -102,7 +102,7 @@ def forces(problem: uem.UnitedProblem) -> dict[str, float]:
 
 
 def joint_diagram(n: float) -> tuple[uem.UnitedProblem, dict[str, Any]]:
-    """The structure in its last state, and what was measured."""
+    """The structure in its last state, and the results."""
     phi = share(n)
     problem, bolts, pull = make(n, tied=False)
     problem.solve()

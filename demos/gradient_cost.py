@@ -15,10 +15,10 @@ Options:
 # the moduli of parts of the bodies (100 and 10,000, as many as there are cells at most): a `DG0` field is differentiated by all of its
 # entries at once, and the derivative by a part's modulus is a sum of those by its cells.
 #
-# - *Linear bodies*: the stiffness that the forward solve factorised serves the adjoint problem too, and what is left is two solves with
+# - *Linear bodies*: the stiffness that the forward solve factorised serves the adjoint problem too; there remain two solves with
 #   the factors. The forward solve is one with new moduli, as in an iteration of an optimisation.
 # - *Finite strain*: the tangent at the state that was found is assembled and factorised, as in one more Newton iteration. The forward solve
-#   is one load step; a gradient is told in its Newton iterations, too.
+#   is one load step; the cost of a gradient is also given in Newton iterations.
 #
 # Forms were compiled before; each time is the least of some runs.
 
@@ -92,7 +92,7 @@ class Scene:
 
 
 def clock(call) -> tuple[float, object]:
-    """Seconds that a call takes on the slowest rank, and what it returns."""
+    """Seconds that a call takes on the slowest rank, and its result."""
     comm.barrier()
     start = time.perf_counter()
     found = call()

@@ -21,7 +21,7 @@ Options:
 # ```
 #
 # The discs move in a viscous medium, whose drag on a volume is gamma rho v, and their material is viscous as well, so that they come
-# to rest. Two sums need no reference solution. In every step the momentum grows by what the weight W, the medium and the contacts give,
+# to rest. Two sums need no reference solution. In every step the momentum grows by the impulses of weight W, medium and contacts,
 #
 # $$
 # p_{n+1} - p_n = \Delta t\, W + \frac{\Delta t}{2} (f_n + f_{n+1}) - \frac{\Delta t}{2} (d_n + d_{n+1}),
@@ -107,7 +107,7 @@ mass = dynamics.mass.total[1]
 
 
 def outer_forces() -> np.ndarray:
-    """Sum of the forces at work beside the weight, of contacts and of the medium."""
+    """Sum of the forces of contacts and of the medium, without the weight."""
     forces = contact.force.x.array.reshape(-1, 2)[: problem.config.n_owned].sum(axis=0)
     return np.sum(comm.allgather(forces), axis=0) - [uem.integrate(form) for form in drag]
 
@@ -138,7 +138,7 @@ if writer is not None:
 
 # %% [markdown]
 # ## The balance
-# What is not balanced is added up over all steps, and told in parts of the momentum that the weight gives in this time.
+# The imbalance is summed over all steps, relative to the impulse of the weight in this time.
 
 # %%
 time, carried, kinetic, active = np.array(rows).T

@@ -102,7 +102,7 @@ def solve(h: float, coupling: str = args.coupling) -> tuple[uem.UnitedProblem, d
 
 # %% [markdown]
 # ## Three meshes
-# The last one has the size asked for, every one before it twice the size of the next.
+# The last one has the chosen size, each of the others twice the size of the next.
 
 # %%
 rows = []

@@ -16,7 +16,7 @@ Options:
 # # Which modulus, and how rough?
 #
 # A block that lies on a rough base is dragged by its tail. It sticks first, then slips from the tail to the front, and at last everywhere:
-# the slope of the force tells the modulus, its last value the coefficient of friction, and what lies between tells both.
+# the slope of the force determines the modulus, its last value the coefficient of friction, the part between them both.
 #
 # Each step depends on where contactors stuck in the steps before. `uem.recording` keeps the steps, and one sweep backwards over them gives
 # the derivatives of a sum over all steps, exactly those of the discrete steps, for any number of parameters. Differences need one run more

@@ -49,7 +49,7 @@ args = common.arguments(
 
 # %% [markdown]
 # ## The scene
-# The tool's top is led by hand: down by `depth`, along the slab, off its end. A rigid tool is a disc or a ball that moves, and
+# The motion of the tool's top is prescribed: down by `depth`, along the slab, off its end. A rigid tool is a disc or a ball that moves, and
 # then the slab's nodes are the contactors.
 
 # %%

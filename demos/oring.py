@@ -12,7 +12,7 @@ Options:
 #
 # The cord of an O-ring is squeezed to three quarters of its height between rigid, greased plates. Rubber hardly changes its volume:
 # with nu = 0.4999 bilinear cells that keep it at every point of integration cannot bend, and come out far too stiff; they lock.
-# `residual_form` integrates what resists changes of volume with fewer points.
+# `residual_form` integrates the volumetric part with fewer points.
 #
 # The pressure on the plates is compared with that on a mesh four times as fine.
 
@@ -66,7 +66,7 @@ class Cord:
 
 # %% [markdown]
 # ## The figures
-# The error of the pressure is the root mean square of what nodal pressures differ by, over the largest one.
+# The error of the pressure is the rms deviation of nodal pressures, over the largest pressure.
 
 # %%
 reference = Cord(4 * args.n, args.degree, full=False)

@@ -68,7 +68,7 @@ def solve(
         passes: the contactor of each pass, ``"lower"`` or ``"upper"``.
         quads: 1 for quadrilaterals and hexahedra.
         moved: how far nodes are moved at random, over the size of a cell.
-        width: of the lower block, at least 1; what the upper one leaves uncovered is loaded by p.
+        width: of the lower block, at least 1; the part beyond the upper one is loaded by p.
         coupling: nodes on facets, or mortar.
 
     Returns:

@@ -117,7 +117,7 @@ def united(mesh, tags, coupling, sliding):
 
 # %% [markdown]
 # ## The others
-# They run on rank 0, and all ranks hear of what they come to.
+# They run on rank 0, and all ranks get their results.
 
 
 # %%

@@ -22,7 +22,7 @@ Options:
 # where in plane strain E' = E / (1 - nu^2) and nu' = nu / (1 - nu). Both make up for the interference: u_disc + u_ring = delta gives
 # p. There is no other load: both meshes overlap at the start, and the first solve takes the overlap away.
 #
-# The meshes do not match, and an overlap of b / 1000 is less than what straight cells leave out of an arc. Cells with curved sides,
+# The meshes do not match, and an overlap of b / 1000 is less than the sagitta of straight cells on an arc. Cells with curved sides,
 # of degree 2 like the displacement, follow it closely: contactors project onto the true, curved facets of the bore. With
 # `--degree 1` the polygons' own gaps and overlaps fade with the square of h only.
 
@@ -49,7 +49,7 @@ E_disc, nu_disc, E_ring, nu_ring = 2.1e5, 0.3, 0.7e5, 0.33
 
 # %%
 def lame(E: float, nu: float) -> tuple[float, float]:
-    """Young's modulus and Poisson's ratio that turn plane stress into the kind asked for."""
+    """Young's modulus and Poisson's ratio that turn plane stress into the chosen kind."""
     return (E / (1 - nu**2), nu / (1 - nu)) if args.kind == "plane_strain" else (E, nu)
 
 
@@ -107,7 +107,7 @@ def solve(h: float, coupling: str = args.coupling) -> tuple[uem.UnitedProblem, u
 
 # %% [markdown]
 # ## The figures
-# The last mesh has the size asked for, every one before it twice the size of the next.
+# The last mesh has the chosen size, each of the others twice the size of the next.
 
 # %%
 rows = []

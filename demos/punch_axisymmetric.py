@@ -90,7 +90,7 @@ common.report(args, {"punch_error": max(row["error"] for row in first), **rows[-
 
 # %% [markdown]
 # ## The picture
-# The strain around the axis, and the pressures over the radius, on the last mesh; the settlements on all meshes beside those published.
+# The strain around the axis, and the pressures over the radius, on the last mesh; the settlements on all meshes and those published.
 
 # %%
 if args.plot:

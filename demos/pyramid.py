@@ -1,4 +1,4 @@
-"""Pyramids of 3, 6 and 10 discs without friction between two walls: what the floor and the walls carry.
+"""Pyramids of 3, 6 and 10 discs without friction between two walls: the forces on the floor and the walls.
 
 python3 demos/pyramid.py --plot pyramid.png
 

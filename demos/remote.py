@@ -10,7 +10,7 @@ Options:
 # %% [markdown]
 # # Remote loads and a rigid flywheel
 #
-# The tip of a beam moves rigidly with a point beside it, where a force and a moment act. Elements of degree 2 without lateral
+# The tip of a beam moves rigidly with a point outside of it, where a force and a moment act. Elements of degree 2 without lateral
 # contraction carry tension and pure bending exactly, so that motions of the point are those of beam theory; under a shear force the
 # rotation is, by reciprocity. With `distribute=True` the tip is not stiffened, and forces and moments still balance at the root.
 #
@@ -33,7 +33,7 @@ mesh, tags = uem.read_gmsh(common.MESHES / "remote.geo", comm, gdim=2, parameter
 
 # %% [markdown]
 # ## Statics
-# The root is held by a coupling that is led to zero, which tells force and moment there; the wheel is parked likewise.
+# The root is held by a coupling with zero motion, whose reactions are force and moment there; so is the wheel while it waits.
 
 # %%
 V = uem.function_space(mesh, 2, (2,))
@@ -42,7 +42,7 @@ law = uem.LinearElastic(E, 0.0, kind="plane_stress")
 form = law.residual(u, v) * uem.dx(tags["beam"])
 e, y = point - (L, 0.0)
 EI = E * h**3 / 12
-# force and moment, and what of the motion (u_x, u_y, angle) beam theory knows; tension acts through the middle of the beam
+# force and moment, and the parts of the motion (u_x, u_y, angle) that beam theory gives; tension acts through the middle of the beam
 loads = {
     "tension": ((1.0, 0.0), y, (L / E, 0.0, 0.0)),
     "bending": ((0.0, 0.0), 1.0, (-L * y / EI, (L**2 / 2 + L * e) / EI, L / EI)),

@@ -112,7 +112,7 @@ if args.output:
         writer.write(step)
 
 # %% [markdown]
-# What remains is the rounding of coordinates beside eps R.
+# The remaining error is the rounding of coordinates relative to eps R.
 
 # %%
 if args.coupling == "mortar" or not args.more:

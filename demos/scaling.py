@@ -1,4 +1,4 @@
-"""How contact scales: speed-up of a Hertz scene on several ranks, what ranks receive in a search, and its time against its size.
+"""How contact scales: speed-up of a Hertz scene on several ranks, data that ranks receive in a search, and its time over its size.
 
 python3 demos/scaling.py --json scaling.json --plot scaling.png
 
@@ -85,7 +85,7 @@ a = 0.005
 
 
 def scene(dofs: int) -> Callable[[], uem.UnitedProblem]:
-    """A Hertz scene with about so many unknowns: what makes its problem (collective)."""
+    """A Hertz scene with about so many unknowns: a function that makes its problem (collective)."""
     parameters = {"h": 0.1 * a * (89_000 / dofs) ** (1 / 3), "zone": 1.4 * a, "growth": 0.8 / a}
     mesh, tags = uem.read_gmsh(common.MESHES / "hertz_sphere.geo", comm, gdim=3, parameters=parameters)
     V = uem.function_space(mesh, 1, (3,))
@@ -102,7 +102,7 @@ def scene(dofs: int) -> Callable[[], uem.UnitedProblem]:
 
 
 def solve(dofs: int, runs: int) -> dict[str, object]:
-    """Solve a Hertz scene with about so many unknowns some times: the quickest run, and what a search of it sends (collective)."""
+    """Solve a Hertz scene with about so many unknowns some times: the quickest run, and the data that its search sends (collective)."""
     found, make = [], scene(dofs)
     for _ in range(runs):
         common.free_memory()
@@ -208,7 +208,7 @@ def here(dofs: int, sizes: str, searches: str, counted: int) -> dict[str, list]:
 
 # %%
 def apart(ranks: int, **options: object) -> dict[str, list]:
-    """What this script measures on so many ranks, told from this one's MPI."""
+    """Results of this script on so many ranks, in a process of its own."""
     mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
     if mpiexec is None:
         raise RuntimeError(

@@ -12,7 +12,7 @@ Options:
 # # Seal in displacement and pressure
 #
 # An O-ring of rubber that keeps its volume is squeezed to three quarters of its height in a groove, until it touches both side walls.
-# At nu = 0.5 the pressure no longer follows from the displacement: it is an unknown beside it, of one degree less (Taylor and Hood).
+# At nu = 0.5 the pressure no longer follows from the displacement: it is a second unknown, of one degree less (Taylor and Hood).
 # The contacts unite components of the displacement; the pressure is a part of the same mixed space, and stays as it is.
 #
 # The force is compared with that of `oring.py`, in displacements alone with nu = 0.4999 and fewer points of integration, on a mesh four
@@ -43,7 +43,7 @@ class Seal:
     Attributes:
         force: on the plate per length of the cord.
         side: on the wall.
-        volume: of the cord, over what it was.
+        volume: of the cord, over the initial one.
     """
 
     def __init__(self, n: int, nu: float, mixed: bool):

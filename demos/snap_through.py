@@ -1,4 +1,4 @@
-"""Snap-through of two cantilevers in contact, led by displacement control past the limit point and off the target's end.
+"""Snap-through of two cantilevers in contact, by displacement control past the limit point and off the target's end.
 
 python3 demos/snap_through.py --plot snap_through.png
 
@@ -9,7 +9,7 @@ Options:
 # %% [markdown]
 # # Snap-through
 #
-# Two slender cantilevers reach over each other. A point of the upper one is led down by w; its tip A comes upon the lower beam,
+# Two slender cantilevers reach over each other. A point of the upper one is moved down by w; its tip A comes upon the lower beam,
 # bends it down and slides on it towards its end, through large rotations: the first example of [UEM], in dimensions that let
 # every phase of it occur. The load P that this takes grows up to a limit point, at which the beams would snap through under a
 # dead load, falls, and grows again. P has kinks where A goes on to the next facet. At last A slides off, and the lower beam
@@ -46,7 +46,7 @@ reference = {
 #
 # A point has no facet to integrate over: with `--coupling mortar` it keeps the equation of a node, and the figures are the same.
 #
-# What springs back sweeps past what held it. A is then far below the lower beam's top, and yet not in this beam but behind it;
+# The beam that springs back passes the one that held it. A is then far below the lower beam's top, and yet not in this beam but behind it;
 # `thickness` tells the two apart for a contactor that has been past the target's end.
 
 # %%

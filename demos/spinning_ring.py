@@ -120,7 +120,7 @@ common.report(args, results)
 
 # %% [markdown]
 # ## The picture
-# Rings at equal times, each drawn beside the one before.
+# Rings at equal times, each to the right of the one before.
 
 # %%
 if args.plot:
@@ -142,5 +142,5 @@ if args.plot:
 
 # %%
 assert results["cone_excess"] < 1e-10 and results["momentum_error"] < 1e-10 and results["angular_momentum_error"] < 1e-10, results
-# what the wall's grip on a step costs is of first order in it
+# the error due to steps in which contact begins or ends is of first order in their length
 assert all(row["friction"] > 0 > row["energy"] > -args.dt for row in rows), rows

@@ -12,16 +12,16 @@ Options:
 # %% [markdown]
 # # Stability
 #
-# Each row is a case at the end of what a method can meet: stiffnesses nine orders apart, contactors on a vertex to the last bit,
+# Each row is an extreme case: stiffnesses nine orders apart, contactors on a vertex to the last bit,
 # bodies that nothing holds, steps that fly through the target. Each column is a method. A cell is
 #
 # - *correct*: force and energy are right to 1 %, no contactor is deeper in its target than 1e-3 of an element, and forces are in
 #   equilibrium, along normals and in pairs, to 1e-3; with mortar, whose conditions hold in the mean over the facets around a
 #   contactor, gaps are these means, and forces lie along the target's normals, but for 1e-2 where a mesh ends over a facet;
-# - a *named error*: the method says what it cannot do, which is what it should do where a case contradicts itself;
+# - a *named error*: the method names its limit, as it should if a case contradicts itself;
 # - *wrong*: anything else, with the figure that shows it.
 #
-# Right is what follows from a closed form, from balances, or from the conditions of contact, which are read from the bodies and not
+# The right result follows from a closed form, from balances, or from the conditions of contact, which are read from the bodies and not
 # from the method (`benchmarks/cases_laws.py`). The cases are in `benchmarks/cases_*.py`.
 
 # %%
@@ -49,7 +49,7 @@ columns = [c for c in COLUMNS if args.methods == "all" or c.name in asked or c.m
 rows = [c for c in CASES if (args.cases == "all" and (c.quick or not args.quick)) or c.name in picked]
 if not columns or not rows:
     sys.exit(f"nothing to do: --methods are {', '.join(COLUMN_NAMES)}; --cases are {', '.join(c.name for c in CASES)}")
-# what other runs have found, by case and method, and their condition numbers: files of theirs are --known
+# results of other runs, by case and method, and their condition numbers: files of theirs are --known
 known = [json.loads(Path(file).read_text(encoding="utf-8")) for file in args.known.split(",") if file]
 known_cells = {(cell["case"], cell["method"]): cell for run in known for cell in run["cells"]}
 known_curves = [curve for run in known for curve in run.get("condition", ())]
@@ -76,7 +76,7 @@ def say(name: str, texts: list[str]) -> None:
 
 
 def keep(results: dict) -> None:
-    """Write the JSON file, after every row, so that a run that is stopped leaves what it has found."""
+    """Write the JSON file, after every row, so that a run that is stopped keeps its results."""
     if args.json and comm.rank == 0:
         Path(args.json).parent.mkdir(parents=True, exist_ok=True)
         Path(args.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")

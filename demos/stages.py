@@ -1,4 +1,4 @@
-"""What a scene does not need is not done: how often every demo runs each stage of the method, and what its active set costs.
+"""Scenes run only the stages that they need: how often every demo runs each stage of the method, and the cost of its active set.
 
 python3 demos/stages.py --plot stages.png
 
@@ -18,7 +18,7 @@ Options:
 # - assembly of the *tangent* K and *factorisation*, or set-up of the preconditioner: once where bodies are linear and contacts stay;
 # - *mass*: not in statics;
 # - *history*, return mapping and commits: not in elastic bodies;
-# - *output*, fields, tables and checkpoints: only where a file is asked for. With --output the demos write theirs to folders in DIR.
+# - *output*, fields, tables and checkpoints: only if a file is given. With --output the demos write theirs to folders in DIR.
 #
 # Who touches, sticks or slips is found by exchanges of contactors within a linearised problem. A second table tells how many load or time
 # steps, Newton iterations and exchanges there were, and how many factorisations, or set-ups of a preconditioner, did for all of them.
@@ -55,7 +55,7 @@ STAGES = {
     "output": ["write fields", "write table", "write checkpoint", "read checkpoint"],
 }
 
-#: Runs a demo and writes down what DOLFINx's timers have counted: script, file, names of timers, options.
+#: Runs a demo and writes down the counts of DOLFINx's timers: script, file, names of timers, options.
 RUNNER = """
 import json, runpy, sys, time
 script, file, timers, *options = sys.argv[1:]

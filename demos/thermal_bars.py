@@ -87,7 +87,7 @@ balance = touching.contact.heat_balance()
 
 # %% [markdown]
 # ## The gap
-# With the hot end at T the bars together want to grow by `alpha L (T + q L (1/k1 - 1/k2) / 2)`: what is more than the gap is pressed
+# With the hot end at T the bars together want to grow by `alpha L (T + q L (1/k1 - 1/k2) / 2)`: the part beyond the gap is pressed
 # together. The gap closes at `gap / (alpha L)`, from where on pressure and flux depend on each other.
 
 # %%

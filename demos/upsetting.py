@@ -28,7 +28,7 @@ Options:
 # p = Y e^{2 \mu (a - r) / h}, \qquad \bar p = 2 Y \frac{e^q - 1 - q}{q^2}, \qquad q = \frac{2 \mu a}{h}
 # $$
 #
-# with the radius a. The method knows nothing of the shear beside the tools and of bulging sides, and is good to some per cent where the
+# with the radius a. The method neglects the shear at the tools and bulging sides, and is good to some per cent where the
 # billet is wider than high. With `--hardening` the mean strain ln(h0 / h) tells the yield stress.
 
 # %%

@@ -131,7 +131,7 @@ common.report(args, results)
 
 # %% [markdown]
 # ## The picture
-# The pins as they are worn, and the depth that the round one has lost, beside that of the half-plane.
+# The pins as they are worn, and the depth that the round one has lost, and that of the half-plane.
 
 # %%
 if args.plot:

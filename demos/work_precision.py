@@ -54,7 +54,7 @@ points = []
 
 
 def keep(results: dict) -> None:
-    """Write the JSON file; after every problem, so that a run that is stopped leaves what it has found."""
+    """Write the JSON file; after every problem, so that a run that is stopped keeps its results."""
     if args.json and comm.rank == 0:
         Path(args.json).parent.mkdir(parents=True, exist_ok=True)
         Path(args.json).write_text(json.dumps(results | {"points": points}, indent=1) + "\n", encoding="utf-8")
