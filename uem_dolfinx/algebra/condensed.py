@@ -1,14 +1,14 @@
-"""The united problem condensed onto the components that contact touches: one factorisation for every ``Q'(K + G)P`` of one K.
+"""The constrained problem condensed onto the components in contact: one factorisation for every ``Q'(K + G)P`` of one K.
 
-P and Q are the identity but at eliminated nodes and those that they follow, and the curvature G is zero but there. With C, the
+P and Q differ from the identity, and the curvature G from zero, only at eliminated nodes and the nodes that they follow. With C, the
 components of these nodes, and I, all others,
 
     S = K_CC - K_CI K_II^-1 K_IC                                        MUMPS makes it with the factorisation of K_II
     Q'(S + G)P dq_C = Q'(r_C - K_CI K_II^-1 r_I)                        dense, by LAPACK on rank 0
     dq_I = K_II^-1 (r_I - K_IC P dq_C)
 
-for the right-hand side ``(Q'r_C, r_I)``. C grows with what is touched, as long as K stays. From an increment du under the forces on I,
-first that with C at rest, others under the same are dense problems alone, as long as only C is asked:
+for the right-hand side ``(Q'r_C, r_I)``. C grows with the contact as long as K is unchanged. du is first computed with C at rest under
+the forces on I. Other increments e_C under the same forces need dense algebra only, as long as only the unknowns on C are needed:
 
     K (du + e) = K du + S e_C on C, and as K du on I                    e_I = -K_II^-1 K_IC e_C in the end
 """
@@ -37,9 +37,9 @@ FOR_EACH_UNKNOWN = 30_000
 
 
 class Condensed:
-    """The factorisation of one K without the components of the contact, and the united problem that was made of it last.
+    """The factorisation of one K without the components of the contact, and the last constrained problem that uses it.
 
-    Not of mixed problems: without those components a body that keeps its volume may be enclosed, and its matrix be singular.
+    Not for mixed problems: with those components fixed, an incompressible body may be enclosed, and its matrix singular.
 
     Args:
         space: the space that K acts on.
@@ -47,13 +47,13 @@ class Condensed:
 
     def __init__(self, space: Nodes):
         self.space = space
-        #: K, and what MUMPS expects its factorisation to take, by its pattern alone.
+        #: K, and the cost of its factorisation that MUMPS estimates from its sparsity pattern.
         self._expected: tuple[PETSc.Mat, mumps.Expected] | None = None
         self.drop()
 
-    #: What solves with K_II.
+    #: Preconditioner that solves with K_II.
     _pc: Any = None
-    #: Owned nodes ``(n_owned,)`` that may be followed next to those that are, by ``(n_owned,)`` of them (collective); None for none.
+    #: Mask of owned nodes ``(n_owned,)`` that may be followed next, from the mask of followed nodes ``(n_owned,)`` (collective), or None.
     beside: Callable[[Bools], Bools] | None = None
 
     def drop(self) -> None:
@@ -63,34 +63,34 @@ class Condensed:
             self._pc.destroy()
         #: K, the state of its values, and the components without Dirichlet condition.
         self._made_for: tuple[PETSc.Mat, int, Bools] | None = None
-        #: Whether a step begins, which may not depend on what others have touched.
+        #: Whether a step begins: its C must not depend on contacts of earlier steps.
         self._begins = False
-        #: Which owned nodes C has, their components, how many those of every rank are on rank 0, S' there, and whether K_II has a
-        #: negative determinant, and negative eigenvalues.
+        #: Mask of the owned nodes of C, their components, on rank 0 the number of components of every rank and S', and whether K_II has
+        #: a negative determinant, and negative eigenvalues.
         self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
-        #: Whether C had those beside the followed nodes when it was made.
+        #: Whether C included the nodes adjacent to the followed nodes when it was made.
         self._wide = False
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
         self._pc = None
         self._St: Any = None
         self._negative_inside = self._indefinite_inside = False
-        #: P, Q, K and G of the united problem, and on rank 0 its dense matrix.
+        #: P, Q, K and G of the constrained problem, and on rank 0 its dense matrix.
         self.made_of: Any = None
         self._dense: _Dense | None = None
-        #: Whether the united matrix has a negative determinant, and, where it is symmetric, negative eigenvalues.
+        #: Whether the constrained matrix has a negative determinant, and, if it is symmetric, negative eigenvalues.
         self.negative = self.indefinite = False
         self.begin_at(None)
-        #: An increment du under the forces on I of the last solve, with K du, and whether unknowns of I have been solved for, too.
+        #: An increment du under the forces on I of the last solve, with K du, and whether the unknowns of I have been computed, too.
         self._known: tuple[PETSc.Vec, PETSc.Vec] | None = None
         self.whole = True
 
     def begin_step(self) -> None:
-        """Let C depend on what this step touches alone: a run that goes on from a checkpoint takes the same."""
+        """Let C depend on the contacts of this step only, so that a run restarted from a checkpoint uses the same C."""
         self._begins = True
 
     def serves(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> bool:
-        """Whether this K is factorised, and C has all that P, Q and G touch (collective)."""
+        """Whether this K is factorised, and C contains all nodes that P, Q and G need (collective)."""
         lacks = True
         if self._is_of(K):
             followed = self._followed(P, Q, holding=not self._begins)
@@ -104,7 +104,7 @@ class Condensed:
         return self._made_for is not None and self._made_for[0] == K and self._made_for[1] == K.stateGet()
 
     def _followed(self, P: Restriction, Q: Restriction, holding: bool) -> Bools:
-        """Owned nodes that equations of any rank follow, only ``holding`` ones or all ``(n_owned,)`` (collective)."""
+        """Mask of owned nodes followed by equations of any rank, only the active ones if ``holding`` ``(n_owned,)`` (collective)."""
         n, first = self.space.n_owned, self.space.first
         marked = np.zeros(n, dtype=bool)
         for R in (P,) if P is Q else (P, Q):
@@ -115,14 +115,14 @@ class Condensed:
         return marked
 
     def _touched(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None, followed: Bools, holding: bool) -> Bools:
-        """Nodes that C needs: those of equations, those in G, and those held otherwise than before ``(n_owned,)``.
+        """Mask of nodes that C needs: nodes of equations, nodes in G, and nodes with changed Dirichlet conditions ``(n_owned,)``.
 
         Args:
-            P: of a united matrix.
-            Q: of the same.
+            P: of a constrained matrix.
+            Q: of the same matrix.
             G: the curvature.
             followed: nodes that the equations follow ``(n_owned,)``.
-            holding: whether only equations count that hold.
+            holding: whether only active equations count.
         """
         touched = followed.copy()
         for R in (P,) if P is Q else (P, Q):
@@ -135,11 +135,11 @@ class Condensed:
         return touched
 
     def factorise(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, pc: PETSc.PC, symmetric: bool) -> bool:
-        """Factorise K without all that P, Q and G touch or may touch; whether that is cheaper than as a whole, and done (collective).
+        """Factorise K without the nodes in contact; whether this is cheaper than a full factorisation and succeeded (collective).
 
         Args:
-            P: of a united matrix.
-            Q: of the same.
+            P: of a constrained matrix.
+            Q: of the same matrix.
             K: the tangent.
             G: the curvature.
             pc: for MUMPS, without a matrix.
@@ -153,7 +153,7 @@ class Condensed:
         if not self._is_cheaper(nodes, K, pc):
             return False
         if self.beside is not None:
-            # feet that move to facets beside theirs find them there
+            # closest points that move to adjacent facets then need no new factorisation
             wide = nodes | self.beside(followed)
             self._wide = self._is_cheaper(wide, K, pc)
             nodes = wide if self._wide else nodes
@@ -187,10 +187,10 @@ class Condensed:
         return True
 
     def _is_cheaper(self, nodes: Bools, K: PETSc.Mat, pc: PETSc.PC) -> bool:
-        """Whether dense algebra of owned ``nodes (n_owned,)`` costs no more than factorising the whole, alike on all ranks (collective).
+        """Whether dense algebra of owned ``nodes (n_owned,)`` costs no more than a full factorisation, the same on all ranks (collective).
 
-        ``size^3 / 3`` operations stand against those that MUMPS counts in its analysis of K, which is made once and where it decides.
-        Then S has no more entries than these factors, either.
+        ``size^3 / 3`` operations are compared with the count in MUMPS' analysis of K, which is made once and only if it is decisive.
+        S must then not have more entries than these factors, either.
         """
         size = reduced(self.space.comm, self.space.block * int(nodes.sum()))
         dense, beside = size**3 / 3 * (1 if pc.getType() == "cholesky" else 2), FOR_EACH_UNKNOWN * K.getSize()[0]
@@ -202,7 +202,7 @@ class Condensed:
         return dense <= flops + beside and size**2 <= entries
 
     def unite(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None) -> None:
-        """Make the dense united matrix; ``serves`` must hold (collective)."""
+        """Make the dense constrained matrix; ``serves`` must be true (collective)."""
         assert self._made_for is not None
         nodes = np.flatnonzero(self._nodes)
         with timed("restriction matrix P"):
@@ -221,21 +221,21 @@ class Condensed:
             self.negative, self.indefinite = self._negative_inside != negative, self._indefinite_inside or indefinite
 
     def begin_at(self, c: PETSc.Vec | None, rounding: float = 0.0) -> None:
-        """Take what the increment is without the unknowns that are solved for next.
+        """Set the increment to which the next solves add ``P dq``.
 
         Args:
-            c: that increment; None is none, and unknowns of I are then solved for at once.
-            rounding: norm of forces that are none on I.
+            c: that increment; None is zero, and solves then complete the unknowns of I at once.
+            rounding: norm below which forces on I are rounding.
         """
         self._closure, self._rounding = c, rounding
 
     def solve(self, rhs: PETSc.Vec, again: bool = False, accuracy: float = 0.0) -> PETSc.Vec:
-        """Unknowns dq of the united problem, those of I to be completed; not finite where it is singular (collective).
+        """Unknowns dq of the constrained problem, to be completed on I; not finite if the matrix is singular (collective).
 
         Args:
             rhs: the right-hand side.
-            again: whether the forces on I are those of the increment whose forces were asked for last.
-            accuracy: part of the right-hand side that may be left on I if it is rounding, too.
+            again: whether the forces on I are the same as for the known increment.
+            accuracy: relative residual that is acceptable on I if it is rounding, too.
         """
         (P, Q, K, _), at = self.made_of, self._at
         c = self.space.vector(np.zeros_like(rhs.array_r)) if self._closure is None else self._closure
@@ -255,9 +255,9 @@ class Condensed:
     def _resting(
         self, P: Restriction, K: PETSc.Mat, rhs: PETSc.Vec, c: PETSc.Vec, accuracy: float
     ) -> tuple[PETSc.Vec, PETSc.Vec]:
-        """The increment du under the forces on I while C rests, and ``K du`` (collective).
+        """The increment du under the forces on I with C at rest, and ``K du`` (collective).
 
-        On I ``r + K c`` is there without what c does to C: where K was solved with last, and no load has changed, that is rounding.
+        The forces on I are ``r + K c`` with c set to zero on C. If K was used in the last solve and loads are unchanged, they are rounding.
         """
         inner, du = P.used.ravel().copy(), c.copy()
         inner[self._at] = False
@@ -270,12 +270,12 @@ class Condensed:
         return du, forms.product(K, du)
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec, exact: bool) -> PETSc.Vec:
-        """``K du`` of an increment that the last solve has found, but for prescribed components away from the contact (collective).
+        """``K du`` of an increment of the last solve, except at prescribed components outside the contact (collective).
 
         Args:
             K: the tangent.
             du: the increment.
-            exact: whether no more than rounding is left of the forces on I.
+            exact: whether the forces on I are solved to rounding.
         """
         if not self.whole and self._known is not None:
             (before, known), at = self._known, self._at
@@ -287,7 +287,7 @@ class Condensed:
         return forces
 
     def complete(self, dq: PETSc.Vec, asked: Sequence[Indices] | None = None) -> PETSc.Vec:
-        """Unknowns dq of the last solve, those of I as well; if owned nodes are ``asked`` for, only where one is not in C (collective)."""
+        """Unknowns dq of the last solve, on I as well; if owned nodes are given as ``asked``, only if one is not in C (collective)."""
         if self.whole:
             return dq
         if asked is not None and not reduced(self.space.comm, int(any(not self._nodes[nodes].all() for nodes in asked))):
@@ -306,7 +306,7 @@ class Condensed:
         return whole
 
     def _solve_inside(self, P: Restriction, rhs: PETSc.Vec) -> PETSc.Vec:
-        """``K_II^-1 r_I``, zero where unknowns are not used, and on C (collective)."""
+        """``K_II^-1 r_I``, zero on C and at unused unknowns (collective)."""
         found = rhs.duplicate()
         with timed("solve without the contact"):
             self._pc.apply(rhs, found)
@@ -315,12 +315,12 @@ class Condensed:
         return found
 
     def _on_contact(self, rhs: Array) -> Array:
-        """Solution of the dense problem, of this rank's components of C (collective)."""
+        """Solution of the dense problem at this rank's components of C (collective)."""
         every = self._gathered(rhs)
         return self._scattered(None if self._dense is None else self._dense.solve(every))
 
     def _stiffness(self, du: Array) -> Array:
-        """``S du_C`` of this rank's components of C (collective)."""
+        """``S du_C`` at this rank's components of C (collective)."""
         every = self._gathered(du)
         return self._scattered(every @ self._St if self.space.comm.rank == 0 else None)
 
@@ -328,8 +328,8 @@ class Condensed:
         """A matrix of C as SciPy's, on rank 0; None elsewhere (collective).
 
         Args:
-            blocks: those in owned rows.
-            numbers: on rank 0, of all nodes of C.
+            blocks: of owned rows.
+            numbers: of all nodes of C, on rank 0.
         """
         from scipy.sparse import bsr_matrix
 
@@ -348,7 +348,7 @@ class Condensed:
         return np.concatenate(parts) if parts is not None else np.zeros(0)
 
     def _scattered(self, values: Array | None) -> Array:
-        """What rank 0 has for this rank's components of C (collective)."""
+        """Values from rank 0 at this rank's components of C (collective)."""
         parts = None if values is None or self._counts is None else np.split(values, np.cumsum(self._counts)[:-1])
         return np.asarray(self.space.comm.scatter(parts))
 
@@ -360,8 +360,8 @@ class _Dense:
         transposed: Schur complement, transposed ``(k, k)``.
         G: curvature, sparse, or None.
         P: its used columns, sparse ``(k, m)``.
-        Q: those of Q, or None where it is P.
-        used: of all components ``(k,)``.
+        Q: the used columns of Q, or None if Q is P.
+        used: mask of all components ``(k,)``.
     """
 
     def __init__(self, transposed: Array, G: Any, P: Any, Q: Any, used: Bools):

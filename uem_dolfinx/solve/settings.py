@@ -1,7 +1,7 @@
-"""What a run is made with, in words that a checkpoint keeps: a run that goes on with anything else would be neither run.
+"""Settings of a run in words, for its checkpoint: a run restarted with other settings would differ from both runs.
 
-Values of Constants and Functions are those that a problem was made with, since loads change later; they are told to six digits, which
-no partition changes.
+Values of Constants and Functions are taken when the problem is made, since loads change later. They have six digits, which do not depend
+on the partition.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from uem_dolfinx.restart.numbering import DIGEST
 #: Numbers of a form that are shown.
 #: [format; numbers; -]
 SHOWN = 12
-#: Settings that every contact has.
+#: Settings of every contact.
 OF_CONTACTS = ("coupling", "sliding", "normals", "thickness", "chords")
-#: Of values that there are none of.
+#: Word for missing values.
 NONE = "none"
 
 
 class Settings:
-    """Takes what a problem is made with (making one is collective).
+    """Settings that a problem is made with (the constructor is collective).
 
     Args:
         forms: residual and damping form, by name.
         u: displacement.
         contacts: of the problem.
-        materials: likewise.
-        dynamics: likewise, or None.
-        beside: words for what else there is, by name.
+        materials: of the problem.
+        dynamics: of the problem, or None.
+        beside: words for further settings, by name.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class Settings:
         beside: Mapping[str, str],
     ):
         self.forms, self._contacts, self._dynamics = forms, contacts, dynamics
-        #: Words that are the same on all ranks, and values whose extent over all ranks counts, by name.
+        #: Words that are the same on all ranks, and values described by their range over all ranks, by name.
         self._words: dict[str, str] = dict(beside)
         self._values: dict[str, Array] = {}
-        #: Words of settings that a user who does not name them gets, as far as there are such, by name.
+        #: Words of settings with default values, by name.
         self._usual: dict[str, str] = {}
         of_contacts = defaults(Contact)
         for i, contact in enumerate(contacts, 1):
@@ -125,23 +125,23 @@ class Settings:
         for name, extent in values.items():
             least, most = -comm.allreduce(-extent[0], op=MPI.MAX), comm.allreduce(extent[1], op=MPI.MAX)
             words[name] = NONE if least > most else f"{least:.6g}" + (f" to {most:.6g}" if most > least else "")
-        # what differs from rank to rank by mistake must not be refused on one alone
+        # settings that differ between ranks by mistake must not raise an error on one rank only
         return dict(comm.bcast(words))
 
     def by_default(self, words: Mapping[str, str]) -> set[str]:
-        """Names of settings that have, by these ``words``, their default values."""
+        """Names of settings whose values in ``words`` are the defaults."""
         return {name for name, usual in self._usual.items() if words.get(name) == usual}
 
 
 def defaults(kind: type) -> dict[str, Any]:
-    """What a class is made with where nothing else is said, by name."""
+    """Default values of the arguments of a class, by name."""
     return {name: p.default for name, p in signature(kind).parameters.items() if p.default is not p.empty}
 
 
 def _contents(form: ufl.Form) -> tuple[list[float], list[Any]]:
-    """Numbers in a form, and how often each integral has each kind of operator.
+    """Numbers in a form, and the number of operators of each kind in each integral.
 
-    UFL's own signature is of no use: it depends on what was made before the form, since UFL orders operands by their numbers.
+    UFL's signature is unsuitable: UFL sorts operands by their numbers, so that it depends on objects made before the form.
     """
     numbers, operators = set(), []
     for part in form.integrals():
@@ -157,6 +157,6 @@ def _contents(form: ufl.Form) -> tuple[list[float], list[Any]]:
 
 
 def _extent(values: Any) -> Array:
-    """Least and largest value here."""
+    """Smallest and largest value on this rank."""
     array = np.asarray(values, dtype=float)
     return np.array([array.min(initial=np.inf), array.max(initial=-np.inf)])

@@ -1,7 +1,7 @@
-"""How much of a change of given values a state has taken, of values that steps lead to: derivatives by these are that share of others.
+"""Shares: the derivatives of ramped values in a state with respect to the prescribed values at the end of the ramp.
 
-A value that a ramp leads from a beginning, of share b, has at the part s of the way the share ``s + (1 - s) b``: a change of it is the same
-in all steps.
+A ramp that starts from a value of share b has the share ``s + (1 - s) b`` at its fraction s, if the prescribed value changes by the same
+amount in all steps.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ class Taken:
     """Shares of a committed state: a value.
 
     Attributes:
-        held: of the Dirichlet value of every unknown, ghosts included ``(n,)``, or of all; NaN where nodes were free, whose places depend
-            on everything.
-        led: Constants, and contacts for their offsets, that steps have led, each with its value then, and the share.
+        held: share of the Dirichlet value of every unknown, ghosts included ``(n,)``, or one share of all; NaN where nodes were free at
+            the start of the ramp, since their positions depend on all parameters.
+        led: Constants, and contacts for their offsets, that steps have ramped, each with its value in that state and its share.
     """
 
     held: Array | float = 0.0
     led: tuple[tuple[Any, Any, float], ...] = ()
 
     def of(self, one: Any, other: float = 1.0) -> float:
-        """Share of a Constant, or of the offset of a contact; ``other`` where no step has led it to its present value."""
+        """Share of a Constant, or of the offset of a contact; ``other`` if no step has ramped it to its present value."""
         return next((share for what, value, share in self.led if what is one and _is(what, value)), other)
 
     def began(self, one: Any) -> float:
-        """Likewise of what a step has begun with, whatever it is now; 0 where none had led it."""
+        """Share of its value at the beginning of a step, whatever its value is now; 0 if no step had ramped it."""
         return next((share for what, _, share in self.led if what is one), 0.0)
 
     def now(self) -> Taken:
-        """Without what has been given other values since."""
+        """Without Constants and offsets whose values have been changed since."""
         return replace(self, led=tuple(item for item in self.led if _is(*item[:2])))
 
     def with_led(self, led: Iterator[tuple[Any, float]]) -> Taken:
-        """With the present values of what has been led, and their shares."""
+        """With the present values and the shares of the Constants and offsets in ``led``."""
         new = [(one, _value(one), share) for one, share in led]
         old = [item for item in self.led if all(item[0] is not one for one, _, _ in new)]
         return replace(self, led=(*old, *new))
 
     def by_id(self) -> dict[int, float]:
-        """Shares of what has the value that it was led to."""
+        """Shares of the Constants and offsets that still have their ramped values, by ``id``."""
         return {id(one): share for one, _, share in self.now().led}
 
 
@@ -69,7 +69,7 @@ def _is(one: Any, value: Any) -> bool:
 
 
 def led_by(problem: Any, at: float) -> Iterator[tuple[Any, float]]:
-    """What a problem's load and its ``Step`` lead to given values, and the share at a load factor or time."""
+    """Constants and contacts that a problem's load or its ``Step`` ramps, with their shares at a load factor or time."""
     if problem.stage is not None:
         yield from problem.stage.led(at)
     elif isinstance(problem.load, Mapping):
@@ -96,20 +96,20 @@ def taken_by(problem: Any) -> Taken:
 
 
 def wanted_by_step(problem: Any) -> Array | None:
-    """Where present Dirichlet values would have led the last step ``(n,)``; None for a state that was read within its load steps."""
+    """Unknowns of the last step under the present Dirichlet values ``(n,)``; None for a state that was read within its load steps."""
     progress, (start, fraction, arc) = problem.progress, problem.led
     if start is None and not arc and progress.ramp and progress.factor < 1.0:
         return None
     begin = problem._before.displacement if start is None else start
     wanted = np.array(begin)
     compat.set_bc_values(wanted, problem.bodies.bcs)
-    # a step that has been left has no load any more
+    # after a step has been left, the problem has no load
     load = {one: value for one, value, _ in progress.taken.now().led if isinstance(one, fem.Constant)}
     return np.asarray(problem.bodies.of_owners(ramped(load, problem.bodies.bcs, begin, wanted, fraction)))
 
 
 def uniform(problem: Any, held: Array | float) -> float | None:
-    """The share of all Dirichlet values, if it is known and the same; None if not (collective)."""
+    """The share of all Dirichlet values if it is known and uniform; otherwise None (collective)."""
     own = np.broadcast_to(held, len(problem.bodies.held))[problem.bodies.held]
     own = np.where(np.isnan(own), np.inf, own)
     low = float(reduced(problem.comm, np.min(own, initial=np.inf), op=MPI.MIN))
@@ -118,12 +118,12 @@ def uniform(problem: Any, held: Array | float) -> float | None:
 
 
 def to_checkpoint(problem: Any) -> list[float | None]:
-    """What ``from_checkpoint`` reads (collective)."""
+    """Uniform shares at the beginning of the ramp and now, for ``from_checkpoint`` (collective)."""
     return [uniform(problem, shares.held) for shares in (problem.progress.began, problem.progress.taken)]
 
 
 def from_checkpoint(problem: Any, kept: list[float | None]) -> tuple[Taken, Taken]:
-    """Shares of a committed state from what ``to_checkpoint`` has told of the beginning of its ramp, and of itself."""
+    """Shares at the beginning of the ramp and of the committed state, from the values that ``to_checkpoint`` returned."""
     at, load = problem.progress.factor, problem.load if isinstance(problem.load, Mapping) else {}
     led = tuple((constant, np.asarray(value) * at, at) for constant, value in load.items() if not callable(value))
     began, held = (np.nan if one is None else one for one in kept)
@@ -134,7 +134,7 @@ def in_rows(problem: Any, held: Array | float) -> Array:
     """Shares of Dirichlet values in the rows of vectors ``(n_rows, gdim)``, zero where free (collective).
 
     Raises:
-        InputError: for values on their way from places of free nodes, which everything has moved.
+        InputError: for values that are ramped from positions of free nodes, since these depend on all parameters.
     """
     bodies = problem.bodies
     unknown = np.flatnonzero(bodies.held & np.isnan(held))

@@ -1,4 +1,4 @@
-"""What the bodies do without contact: forces and tangent of the UFL residual, Dirichlet conditions, materials with history, inertia."""
+"""The bodies without contact: forces and tangent of the UFL residual, Dirichlet conditions, materials with history, inertia."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ class Bodies:
         held: unknowns with a Dirichlet condition, ghosts included ``(n,)``.
         free: components of the displacement without Dirichlet condition ``(n_local, gdim)``.
         free_rows: likewise of all unknowns, in the rows of vectors ``(n_rows, gdim)``.
-        dead: forces at all unknowns that keep their direction, as of what a step releases, ghosts included ``(n,)``; None for none.
-        wanted: values that the Dirichlet conditions ask for, at their unknowns, ghosts included ``(n,)``.
+        dead: forces of fixed direction at all unknowns, such as forces of removed conditions, ghosts included ``(n,)``; None for zero.
+        wanted: prescribed values at the unknowns with Dirichlet conditions, ghosts included ``(n,)``.
         tangent: K.
         points: loads and springs at nodes, or None.
-        stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, by which forces are told from rounding; None until known.
+        stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, for estimates of rounding in forces; None until known.
     """
 
     def __init__(
@@ -93,9 +93,9 @@ class Bodies:
             dynamics.hold(~self.free[: config.n_owned])
         self.wanted: Array = np.array(self.u.x.array)
         self.stiffness: Array | None = None
-        #: The same as the last step left it, with which the next begins.
+        #: Its value at the end of the last step, which the next step starts with.
         self.stiffness_at_start: Array | None = None
-        #: State of the values of K that it is of.
+        #: State counter of the values of K that ``stiffness`` was taken from.
         self._stiffness_of = -1
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self._inversions = Inversions(config) if check and config.moves else None
@@ -107,14 +107,14 @@ class Bodies:
             self._fields = FieldScales(self.unknowns, self.tangent)
 
     def begin_step(self) -> None:
-        """Measure other fields by K of the state that the step begins with, as a run that goes on from a checkpoint does (collective)."""
+        """Scale other fields by K at the beginning of the step, as a run restarted from a checkpoint does (collective)."""
         if self._fields is not None:
             self.tangent.update()
 
     # -- forces --------------------------------------------------------------------------------------------------------
 
     def assemble(self) -> bool:
-        """Residual ``F(u)`` at the present displacement: whether it is finite on all ranks (collective)."""
+        """Assemble the residual ``F(u)`` at the present displacement; whether it is finite on all ranks (collective)."""
         try:
             for material in self.materials:
                 material.update()
@@ -148,7 +148,7 @@ class Bodies:
         return np.asarray(self.config.rows(self._b.array_r)[: self.config.n_owned])
 
     def forces_at_work(self, F: PETSc.Vec) -> Any:
-        """What residuals are small beside: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
+        """Reference for the size of residuals: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
         if self._fields is None:
             return self._beside(F.norm(), [one.size() for one in self._added])
         return self._beside(np.maximum(self.unknowns.norms(F), self._fields.terms()), [one.size() for one in self._added])
@@ -159,7 +159,7 @@ class Bodies:
         return [] if self.dynamics is None else self.dynamics.added
 
     def _beside(self, norm: Any, more: Sequence[float]) -> Any:
-        """A norm of forces, or one for each field ``(n_fields,)``, with others of the displacement."""
+        """A norm of forces, or one for each field ``(n_fields,)``, combined with other norms of the displacement's forces."""
         if not more:
             return norm
         size = float(np.linalg.norm(more))
@@ -178,7 +178,7 @@ class Bodies:
         return self.tangent.K
 
     def initial_stiffness(self) -> Array:
-        """Diagonal of K at the present displacement ``(n_owned, gdim)``, which ``stiffness`` takes no notice of (collective)."""
+        """Diagonal of K at the present displacement ``(n_owned, gdim)``; ``stiffness`` is not updated (collective)."""
         self.assemble()
         self.tangent.update()
         return self._diagonal()
@@ -189,12 +189,12 @@ class Bodies:
         return np.array(diagonal.array_r).reshape(-1, self.config.block)[: self.config.n_owned]
 
     def rounding(self, positioned: npt.NDArray[np.integer]) -> Any:
-        """Norm of the forces that rounding of the displacement, and of the positions of some nodes, can make (collective).
+        """Norm of the forces due to rounding of the displacement, and of the positions of some nodes (collective).
 
-        With other fields one for each ``(n_fields,)``, of what is in their equations.
+        With other fields one norm for each ``(n_fields,)``, from the terms of its equations.
 
         Args:
-            positioned: owned nodes whose position counts, not their displacement alone; repeated ones count repeatedly.
+            positioned: owned nodes whose position is rounded, not their displacement alone; repeated ones count repeatedly.
         """
         if self.stiffness is None:
             return 0.0
@@ -208,11 +208,11 @@ class Bodies:
         return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
 
     def rounding_of_displacement(self) -> float:
-        """Norm of the forces of the displacement that its rounding, and that of its gradient, can make (collective)."""
+        """Norm of the displacement's forces due to rounding of the displacement and of its gradient (collective)."""
         return first(np.maximum(self.rounding(np.zeros(0, np.int32)), self.strain_rounding()))
 
     def rounding_at(self, nodes: npt.NDArray[np.integer]) -> Array:
-        """Forces that rounding of the positions of owned nodes ``(n,)`` can make there ``(n,)``."""
+        """Forces due to rounding of the positions of owned nodes ``(n,)``, at these nodes ``(n,)``."""
         if self.stiffness is None:
             return np.zeros(len(nodes))
         return np.asarray(
@@ -220,12 +220,12 @@ class Bodies:
         )
 
     def above_rounding(self, positioned: bool) -> Any:
-        """Norm of the forces, or one for each field, at those components where they are told from rounding (collective).
+        """Norm of the forces, or one for each field, at the components where they exceed rounding (collective).
 
-        Rounding of a body's displacement is seen at all of its nodes, also where they are held.
+        Rounding of a body's displacement affects all of its nodes, also nodes with Dirichlet conditions.
 
         Args:
-            positioned: whether positions count, not displacements alone.
+            positioned: whether positions are rounded, not displacements alone.
         """
         F, n = self.forces, self.config.n_owned
         if self.stiffness is None:
@@ -242,7 +242,7 @@ class Bodies:
         return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self._first(told)
 
     def remembered(self, positioned: bool) -> Any:
-        """Norm beside which forces of later steps may be rounding: of those above it, and of the terms of other fields (collective)."""
+        """Norm relative to which forces of later steps may be rounding, with the terms of other fields (collective)."""
         told = self.above_rounding(positioned)
         if self._fields is None:
             return told
@@ -250,23 +250,23 @@ class Bodies:
         return np.maximum(told, np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
 
     def strain_rounding(self) -> Any:
-        """Norm of the forces that rounding of ``1 + grad(u)`` can make, or one for each field ``(n_fields,)`` (collective)."""
+        """Norm of the forces due to rounding of ``1 + grad(u)``, or one for each field ``(n_fields,)`` (collective)."""
         if self.stiffness is None or not self.config.moves:
             return 0.0
         size = float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
         return size if self._fields is None else self._fields.strain_rounding(self.config.size) + self._first(size)
 
     def _first(self, of_displacement: float) -> Array:
-        """A norm of the displacement's forces, none of the other fields ``(n_fields,)``."""
+        """A norm of the displacement's forces, with zeros for the other fields ``(n_fields,)``."""
         return np.append(of_displacement, np.zeros(self.unknowns.n_fields - 1))
 
     # -- Dirichlet conditions ------------------------------------------------------------------------------------------
 
     def hold(self, bcs: Sequence[fem.DirichletBC]) -> None:
-        """Take these Dirichlet conditions for all, from the next step on, as the owners of nodes have them (collective).
+        """Replace all Dirichlet conditions from the next step on; the ranks that own the nodes decide (collective).
 
         Raises:
-            InputError: for a component that a condition holds on a rank that does not own it, and none on the one that does.
+            InputError: for a component that has a condition on a rank that does not own it, but not on its owner.
         """
         self.bcs = list(bcs)
         own = np.zeros(len(self.u.x.array), dtype=bool)
@@ -286,7 +286,7 @@ class Bodies:
         self.tangent.hold(self.free_rows)
 
     def of_owners(self, values: AnyArray) -> AnyArray:
-        """Values of all unknowns ``(n,)`` whose ghosts have what their owners have, of the same kind (collective)."""
+        """Values of all unknowns ``(n,)`` with ghosts copied from their owners, of the same type (collective)."""
         if self.comm.size == 1:
             return values
         f = fem.Function(self.u.function_space)
@@ -296,12 +296,12 @@ class Bodies:
 
     @property
     def prescribed(self) -> Array:
-        """Increments that the Dirichlet conditions ask for in the rows of vectors, zero where free ``(n_rows, gdim)``."""
+        """Increments prescribed by the Dirichlet conditions, in the rows of vectors, zero where free ``(n_rows, gdim)``."""
         n = self._n_owned
         return np.asarray(self.config.rows(np.where(self.held[:n], self.wanted[:n] - self.u.x.array[:n], 0.0)))
 
     def dirichlet_met(self) -> bool:
-        """Whether the Dirichlet values are there (collective)."""
+        """Whether the Dirichlet values are met (collective)."""
         there, field = self.u.x.array, self.unknowns.field_of if self.unknowns.mixed else None
         parts = [self.held] if field is None else [self.held & (field == i) for i in range(self.unknowns.n_fields)]
         both = np.array([[np.abs(a).max(initial=0.0) for a in (self.wanted[h] - there[h], self.wanted[h])] for h in parts])
@@ -311,10 +311,10 @@ class Bodies:
     # -- displacement --------------------------------------------------------------------------------------------------
 
     def check_displacement(self, facets: float) -> None:
-        """Refuse a displacement that is not finite, or so large that facets of a length are less than its rounding (collective).
+        """Refuse a displacement that is not finite, or whose rounding exceeds the length of ``facets`` (collective).
 
         Raises:
-            NotFiniteError: if it is so.
+            NotFiniteError: in either case.
         """
         if not np.isfinite(size := self._u.norm()):
             raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
@@ -340,25 +340,25 @@ class Bodies:
         self.u.x.scatter_forward()
 
     def inverted(self) -> str | None:
-        """Where a cell is inside out, if one is (collective)."""
+        """Position of an inverted cell, or None (collective)."""
         return self._inversions.find() if self._inversions is not None else None
 
     # -- checkpoints ---------------------------------------------------------------------------------------------------
 
     def commit(self) -> None:
-        """Keep what materials remember, and the diagonal of K, with the present displacement."""
+        """Commit the history of materials and the diagonal of K with the present displacement."""
         for material in self.materials:
             material.commit()
         self.stiffness_at_start = self.stiffness
 
     def restore(self) -> None:
-        """Go back to what was kept, where the displacement is that of then again."""
+        """Restore the committed state, after the displacement has been reset to the committed one."""
         for material in self.materials:
             material.update()
         self.stiffness, self._stiffness_of = self.stiffness_at_start, -1
 
     def to_checkpoint(self, u: fem.Function) -> bool:
-        """Write the diagonal of K into a Function: whether it is known yet (collective)."""
+        """Write the diagonal of K into a Function; whether it is known (collective)."""
         if self.stiffness is None:
             return False
         u.x.array[: self.stiffness.size] = self.stiffness.ravel()
@@ -366,14 +366,14 @@ class Bodies:
         return True
 
     def from_checkpoint(self, u: fem.Function | None) -> None:
-        """Go on from a diagonal of K that was kept, None if none was known."""
+        """Restore the diagonal of K from a checkpoint; None if it was not known."""
         n = self.config.n_owned * self.config.block
         self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.block)
         self.stiffness_at_start = self.stiffness
 
 
 def configured(u: fem.Function, displacement: int | None) -> Configuration:
-    """Nodes of a displacement, which is u, or the part of u with this number, or of a scalar field (collective)."""
+    """Configuration of u, of its displacement part with this number, or of a scalar field (collective)."""
     if displacement is None:
         V = u.function_space
         if V.dofmap.index_map_bs > 1 or compat.is_mixed(V):
@@ -387,7 +387,7 @@ def configured(u: fem.Function, displacement: int | None) -> Configuration:
 
 
 def solver_of(config: Configuration, prefix: str, options: Any) -> UnitedSolver:
-    """Solver of the united system, which knows of other fields where there are any; arguments as of ``UnitedSolver`` (collective)."""
+    """Solver of the constrained system, with field split for mixed problems; arguments as in ``UnitedSolver`` (collective)."""
     kind: type[UnitedSolver] = UnitedSolver
     if config.unknowns.mixed:
         from uem_dolfinx.algebra.field_split import SolverOfFields

@@ -1,8 +1,8 @@
-"""Bodies that only contact holds: how they come to rest, and what keeps the united system regular until they do.
+"""Bodies that only contact holds: rigid motion into contact, and statically determinate supports that keep the system regular.
 
-A body without enough Dirichlet conditions can move as a rigid body until contact holds it. Each motion that conditions and active
-contacts leave open is either loaded, and then the body falls along it until it touches something, or neutral, and then it is held in a
-statically determinate way, where the reaction is zero.
+A body without enough Dirichlet conditions can move as a rigid body until contact holds it. Motions that conditions and active contacts
+leave open are loaded or neutral. Along loaded motions the body falls until it touches something; neutral motions are held by statically
+determinate supports with zero reactions.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ MOST_RIGID_STEPS = 200
 
 
 class _Held(NamedTuple):
-    """What holds bodies.
+    """Equations that hold bodies.
 
     Attributes:
         rows: equations of contactors that follow their target, and of users.
         rates: how fast each motion opens their gaps, a sparse matrix ``(m, n_motions)``.
-        which: those that cannot part again ``(m,)``: with friction, of ties and of users.
-        basis: motions that these leave open ``(n_motions, k)``.
+        which: mask of rows that cannot separate again: with friction, of ties and of users ``(m,)``.
+        basis: motions that these rows leave open ``(n_motions, k)``.
     """
 
     rows: UnitingEquations
@@ -64,17 +64,17 @@ class _Held(NamedTuple):
 
 
 class FloatingBodies:
-    """What a step does about bodies that only contact holds.
+    """Treatment of bodies that only contact holds, within a step.
 
     Args:
         bodies: without contact.
         pairs: of all contacts.
-        linear: equations of users, None for none.
-        far_apart: contacts that are not looked at until bodies come near; None if all are.
+        linear: equations of users, or None.
+        far_apart: contacts that are not searched until bodies come near; None if all contacts are searched.
 
     Attributes:
         rigid: rigid motions of the bodies; None of a scalar field.
-        motions: those of the present step, None if conditions, springs and inertia hold all bodies.
+        motions: rigid motions of the present step; None if conditions, springs and inertia hold all bodies.
     """
 
     def __init__(
@@ -90,26 +90,26 @@ class FloatingBodies:
             self.rigid = RigidMotions(config, free, finite)
             self._at_rest = self._floating(self.rigid)
             if dynamics is not None:
-                # in a step in time, inertia holds what has mass
+                # in a time step, inertia holds bodies with mass
                 moving = RigidMotions(config, free & ~dynamics.inert, finite)
                 self._in_motion = self._floating(moving)
         self.motions = self._at_rest
-        #: Those that conditions and contacts leave open and that supports hold ``(n_motions, k)``.
+        #: Motions that conditions and contacts leave open, held by supports ``(n_motions, k)``.
         self._open: Array = np.zeros((0, 0))
-        #: Less the displacement that the step began with, and less what bodies have fallen since ``(n_local, gdim)``.
+        #: Minus the displacement at the beginning of the step and minus the rigid motions since ``(n_local, gdim)``.
         self._went: Array = np.zeros((0, 0))
-        #: Sum of the forces that the step began with; None before they were known.
+        #: Sum of the forces at the beginning of the step; None until known.
         self._loads: float | None = None
-        #: Likewise with those that friction alone resists, where all contactors slip.
+        #: Open motions including those that only friction resists, if all contactors slip ``(n_motions, k)``.
         self._sliding: Array = np.zeros((0, 0))
 
     def take(self, pairs: Sequence[Interface], far_apart: FarApart) -> None:
-        """Take the same contacts as they are treated from now on, and which of them are looked at."""
+        """Replace the interfaces of the contacts, and the record of contacts that are searched."""
         self._pairs, self._far_apart = pairs, far_apart
 
     @cached_property
     def _has_springs(self) -> bool:
-        """Whether bodies may be held beside conditions: by springs at nodes, or by a form of displacements themselves."""
+        """Whether springs may hold bodies: springs at nodes, or a form that depends on the values of u, not only on gradients."""
         return self._bodies.points is not None or takes_values(self._bodies.F, self._bodies.u)
 
     def _floating(self, motions: RigidMotions) -> RigidMotions | None:
@@ -127,7 +127,7 @@ class FloatingBodies:
         """Let bodies fall until they touch; ``place`` projects all contactors (collective).
 
         Raises:
-            FloatingBodyError: naming a body, and the motion that nothing stops.
+            FloatingBodyError: names a body and its unrestrained motion.
         """
         if self._bodies.dynamics is not None:
             self.motions = self._in_motion if self._bodies.dynamics.moving else self._at_rest
@@ -140,11 +140,11 @@ class FloatingBodies:
             self._fall(place, freely=True)
 
     def begin_motion(self) -> None:
-        """Take the motions of a step in time for the first acceleration."""
+        """Use the motions of a time step for the first acceleration."""
         self.motions = self._in_motion
 
     def end_step(self) -> None:
-        """Refuse a state in which supports carry more than rounding; in a step in time, say so.
+        """Refuse a state in which supports carry more than rounding; in a time step, warn.
 
         Raises:
             FloatingBodyError: in statics.
@@ -164,16 +164,16 @@ class FloatingBodies:
         logger.warning(told)
 
     def _refuse_thrown(self) -> None:
-        """Refuse a step in which contacts have thrown a body to where they hold it no more (collective).
+        """Refuse a step in which contacts have pushed a body so far that they no longer hold it (collective).
 
         Raises:
-            ThrownBodyError: naming the body.
+            ThrownBodyError: names the body.
         """
         motions, config = self.motions, self._bodies.config
         assert motions is not None
         if not self._open.shape[1]:
             return
-        # what falls has not been thrown
+        # rigid motions of falling bodies do not count
         way = (config.displacement + self._went)[: config.n_owned]
         thrown = motions.part(self._open, way)
         far, else_ = (np.linalg.norm(part, axis=1).max(initial=0.0) for part in (thrown, way - thrown))
@@ -182,22 +182,22 @@ class FloatingBodies:
             raise motions.thrown(thrown, THROWN * else_)
 
     def hold(self, free: Bools, equations: UnitingEquations, resisting: UnitingEquations) -> Bools:
-        """Free components ``(n_rows, gdim)`` without those that hold neutral motions (collective).
+        """Free components ``(n_rows, gdim)`` without the supports that hold neutral motions (collective).
 
         Args:
             free: components without Dirichlet condition ``(n_rows, gdim)``.
-            equations: rows of the relative motions that contacts do not let go on without end.
-            resisting: rows of all relative motions that contacts resist, the same object without friction.
+            equations: rows of the relative motions that contacts bound.
+            resisting: rows of all relative motions that contacts resist; the same object without friction.
         """
         if self.motions is None:
             return free
         self._open = self._sliding = self.motions.open_motions(self._rates(equations))
         if resisting is not equations and self.neutral:
-            # where friction resists no less is resisted
+            # friction resists more motions, never fewer
             self._open = self.motions.open_motions(self._rates(resisting))
         rigid, parted = None if self._linear is None else self._linear.rigid, None
         if rigid is not None:
-            # what couplings leave of their nodes holds these
+            # supports may use the components that rigid couplings leave of their nodes
             parted = rigid.left(np.ones((self._bodies.config.n_owned, free.shape[1]), dtype=bool))
             equations = equations.select(np.arange(len(equations)) < len(equations) - rigid.n_rows)
         left, supports = free.copy(), self.motions.supports(self._sliding, equations, parted)
@@ -205,11 +205,11 @@ class FloatingBodies:
         return left
 
     def slide(self, driving: Array, forces: Array) -> Array | None:
-        """Increment, far beyond all others, of bodies that slide under what the supports carry; None if none does (collective).
+        """Very large increment of the bodies that slide under the forces of the supports; None if no body does (collective).
 
         Args:
             driving: forces that are not in equilibrium, at the owned nodes ``(n_owned, gdim)``.
-            forces: all forces of the bodies, beside which they may be rounding ``(n_owned, gdim)``.
+            forces: all forces of the bodies, relative to which ``driving`` may be rounding ``(n_owned, gdim)``.
         """
         if self.motions is None or self._sliding.shape[1] == self._open.shape[1]:
             return None
@@ -218,27 +218,27 @@ class FloatingBodies:
 
     @property
     def neutral(self) -> bool:
-        """Whether conditions and contacts leave motions open, along which bodies stay where they are."""
+        """Whether conditions and contacts leave motions open; supports keep bodies at rest along them."""
         return self.motions is not None and self._sliding.shape[1] > 0
 
     @property
     def adrift(self) -> bool:
-        """Whether loads drive a body along a motion that supports alone hold, so that no active set is its equilibrium (collective)."""
+        """Whether a motion that only supports hold is loaded, so that no equilibrium exists with this active set (collective)."""
         if self.motions is None:
             return False
         force = self.motions.load(self._open, self._forces())
         return bool(force.any())
 
     def fall_again(self, place: Callable[[], None], changed: bool, in_equilibrium: bool) -> bool:
-        """Let bodies that have lost their hold fall (collective).
+        """Let bodies that contact no longer holds fall (collective).
 
         Args:
             place: projects all contactors (collective).
-            changed: whether the active set has, or is about to.
+            changed: whether the active set has changed, or is about to.
             in_equilibrium: whether the bodies are in equilibrium.
 
         Returns:
-            Whether anything else has changed now.
+            Whether bodies have moved or contactors have become active.
         """
         if self.motions is None:
             return False
@@ -247,24 +247,24 @@ class FloatingBodies:
         if not self._held().basis.shape[1]:
             self.motions.share = 0.0
             return False
-        # a body that has lost its hold on the way falls only when the others have come to rest
+        # a body that contact no longer holds falls only after the active set has stopped changing
         return self._fall(place, freely=not changed)
 
     def without_open_motions(self, du: Array) -> Array:
-        """An increment ``(n_owned * gdim,)`` without what it holds of neutral motions, along which bodies stay (collective)."""
+        """An increment ``(n_owned * gdim,)`` without its part along neutral motions (collective)."""
         if self.motions is None:
             return du
         return du - self.motions.part(self._sliding, du.reshape(-1, self._bodies.config.gdim)).ravel()
 
     def _forces(self) -> Array:
-        """Forces of the bodies, less the loads of contacts, at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        """Forces of the bodies minus the loads of contacts, at the owned nodes ``(n_owned, gdim)`` (collective)."""
         F = self._bodies.forces
         for nodes, loads in filter(None, (pair.applied_forces() for pair in self._pairs)):
             F = F - self._bodies.config.add_at_owners(nodes, loads)
         return F
 
     def _rates(self, equations: UnitingEquations) -> Any:
-        """Rates of the equations that hold, see ``RigidMotions`` (collective)."""
+        """Rates of the active equations, see ``RigidMotions`` (collective)."""
         assert self.motions is not None
         return self.motions.rates(equations.select(equations.active))
 
@@ -273,13 +273,13 @@ class FloatingBodies:
 
         Args:
             place: projects all contactors (collective).
-            freely: otherwise they only take hold of what they touch already.
+            freely: whether bodies move; otherwise only contactors that touch already become active.
 
         Returns:
-            Whether any body has moved or touched something.
+            Whether any body has moved or any contactor has become active.
 
         Raises:
-            FloatingBodyError: naming a body, and the motion that nothing stops.
+            FloatingBodyError: names a body and its unrestrained motion.
         """
         motions = self.motions
         assert motions is not None
@@ -302,10 +302,10 @@ class FloatingBodies:
         raise motions.error(before)
 
     def _pace(self, damping: Array, before: Array, v: Array) -> Array:
-        """Factors of every body's next step ``(count,)``, after one in which it has gone by v, and before that by ``before``.
+        """Factors of every body's next step ``(count,)``, from its last step v and the step ``before``.
 
-        A body that turns back goes half as far; one that goes on twice as far, as from where it is nearly balanced, if it stays within
-        what it may turn.
+        The factor is halved if a body reverses. It is doubled if a body continues, for instance from an unstable balance, and twice the
+        step stays within the limit of rotation.
         """
         motions = self.motions
         assert motions is not None
@@ -315,28 +315,28 @@ class FloatingBodies:
         return np.where(along < 0, 0.5 * damping, faster)
 
     def _held(self) -> _Held:
-        """What contacts and equations of users hold where the bodies are now (collective)."""
+        """Motions that contacts and equations of users hold at the present positions (collective)."""
         motions, g = self.motions, self._bodies.config.gdim
         assert motions is not None
         pairs = in_question(self._pairs)
         equations = [pair.equations() for pair in pairs]
         more = [] if self._linear is None else [self._linear.at_present()]
         rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
-        # friction holds what sticks in all directions; contactors without it may part again
+        # sticking contactors are held in all directions; contactors without friction may separate again
         firm = [(e.tied | pair.frictional)[e.resisting.active] for pair, e in zip(pairs, equations)]
         which = np.concatenate([np.zeros(0, bool), *firm, *(np.ones(len(e), bool) for e in more)])
         rates = motions.rates(rows)
         return _Held(rows, rates, which, motions.open_motions(rates[which]))
 
     def _step(self, damping: Array, freely: bool) -> tuple[Array | None, bool]:
-        """Contactors that touch and carry become active; an increment of all motions under the loads (collective).
+        """Activate contactors that touch and carry force; an increment of all motions under the loads (collective).
 
         Args:
-            damping: of every body's step, up to 1 ``(count,)``.
+            damping: factor of every body's step ``(count,)``.
             freely: see ``_fall``.
 
         Returns:
-            The increment, None where contact holds the bodies, and whether any contactor has become active.
+            The increment, None if contact holds the bodies, and whether any contactor has become active.
 
         Raises:
             FloatingBodyError: if the bodies move and no gap closes.
@@ -360,7 +360,7 @@ class FloatingBodies:
         f = basis @ (basis.T @ force)
         size = np.linalg.norm(f.reshape(-1, n), axis=1)
         self._loads = scale if self._loads is None else self._loads
-        # where all bodies float, what equilibrium leaves is rounding, and small beside the loads that the step began with
+        # if all bodies float, the residual of equilibrium is rounding, small relative to the loads at the beginning of the step
         if size.max() <= max(LOADED * max(scale, self._loads), self._bodies.rounding_of_displacement()):
             return None, False
         pairs = in_question(self._pairs)
@@ -368,7 +368,7 @@ class FloatingBodies:
         front = UnitingEquations.join(ahead, config.gdim)
         R = vstack([motions.rates(front), held.rates[~held.which]]).tocsr()
         gap = np.concatenate([front.gap, held.rows.gap[~held.which]])
-        # as if each body were as heavy as its load, those without any hardly at all
+        # the mass of each body is proportional to its load; bodies without loads are nearly massless
         weight, turn = np.maximum(size, LIGHT * size.max()), TURN * motions.radius
         ways = self._ways(R, gap, f / np.repeat(weight, n))
         shift = np.maximum(turn, np.where(np.isinf(ways), 0.0, ways))
@@ -390,7 +390,7 @@ class FloatingBodies:
         motions.share = float(np.abs(left).max() / scale)
         if np.abs(v).max() <= TOUCHING * config.size:
             return None, took
-        # a step that no gap closes, nor takes a body out of an overlap, goes on for ever
+        # if no gap closes and no overlap is removed, the motion never stops
         rate, some = R @ v, OPEN * np.abs(v).max()
         if not reduced(comm, bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
             if reduced(comm, any([pair.discretisation.look_farther() for pair in self._pairs]), op=MPI.LOR):
@@ -399,7 +399,7 @@ class FloatingBodies:
         return v, took
 
     def _ways(self, R: Any, gap: Array, v: Array) -> Array:
-        """How far bodies go in motions ``v (n_motions,)`` until the first of their gaps closes ``(count,)`` (collective)."""
+        """Multiple of motions ``v (n_motions,)`` at which the first gap of every body closes ``(count,)`` (collective)."""
         motions = self.motions
         assert motions is not None
         ways, rate = np.full(motions.count, np.inf), R @ v

@@ -1,6 +1,6 @@
-"""The united Newton loop [UEM, 4.4 and Fig. A.1]: place, residual, constraints, solve, until equilibrium and contact hold.
+"""The united Newton loop [UEM, 4.4 and Fig. A.1]: project, residual, constraints, solve, until equilibrium and contact hold.
 
-The loop speaks to the bodies and to a ``ContactMethod``, so it serves statics and dynamics, and any way to impose contact, alike.
+The loop uses the bodies and a ``ContactMethod`` only, so that it serves statics, dynamics and any method to impose contact.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ ACCURACY_AT_THE_END = 0.1
 #: [bound; norm of the forces; test_trust.py::test_converged_means_converged]
 LARGEST_ROUNDING = 1e-4
 
-#: Whether a residual of this norm, beside forces of this norm, with this rounding, is an equilibrium.
+#: Whether the norm of a residual, relative to a norm of forces and to its rounding, is an equilibrium.
 InEquilibrium = Callable[[Norm, Norm, Norm], bool]
 
 
@@ -56,10 +56,10 @@ class Iteration:
     Attributes:
         residual: norm of ``Q'r`` over the forces at work.
         gap: largest gap of an active contactor, a length.
-        active: number of active contactors over all ranks with which the bodies moved on.
+        active: number of active contactors over all ranks in the step that the bodies took.
         changed: whether contactors were activated or released, or entered or left a corner.
         linear_iterations: of the solves that followed; 0 if the step had converged.
-        step_length: of the line search in the step that led here.
+        step_length: of the line search in the step to this iteration.
         exchanges: further solves with the same tangent, each with another active set.
     """
 
@@ -78,15 +78,15 @@ class IterationState:
 
     Attributes:
         trial: P and c, by which the bodies move.
-        test: Q, by which forces are handed on; the same object as P unless a coupling tells trial from test rows.
+        test: Q, which transfers forces; the same object as P unless trial and test rows of a coupling differ.
         residual: ``Q'F``, the out-of-balance forces.
         norm: its norm.
         scale: norm of the forces at work.
         rounding: norm below which a force is rounding of the displacement.
         gap: largest gap of an active contactor, a length.
         active: number of active contactors over all ranks.
-        changed: whether contactors have changed what they are united to because of where they are.
-        right: whether no contactor breaks the conditions of contact, as far as the present forces tell.
+        changed: whether contactors have changed their constraints because of their positions.
+        right: whether all contactors satisfy the contact conditions with the present forces.
         closed: whether gaps and Dirichlet conditions are met.
         in_contact: whether there are contacts at all.
     """
@@ -106,16 +106,16 @@ class IterationState:
 
 
 class LinearisedProblem(NamedTuple):
-    """``Q'KP dq = rhs`` in one active set, and how it is to be solved.
+    """``Q'KP dq = rhs`` for one active set, and how it is solved.
 
     Attributes:
-        state: whose P and Q these are.
+        state: with P and Q.
         rhs: right-hand side ``Q'(r - K c)``.
-        exact: whether solves are to leave no more than rounding, since no iteration follows that makes up for it.
-        iterative: whether solves leave as much as they may, and can go on from the solution of another active set.
+        exact: whether solves must be accurate to rounding, since no further iteration corrects them.
+        iterative: whether solves stop at their tolerance, and can start from the solution of another active set.
         passing: whether another iteration follows in any case.
         fits: whether a full step needs no line search.
-        convex: whether the tangent leaves out what could make it indefinite, so that steps are no longer than forces drive the bodies.
+        convex: whether terms that could make the tangent indefinite are neglected, so that the line search may also lengthen steps.
     """
 
     state: IterationState
@@ -133,10 +133,10 @@ class Increment(NamedTuple):
     Attributes:
         dq: unknowns.
         du: ``P dq + c``.
-        rhs: right-hand side that they belong to; a method that leads the load adds to it.
+        rhs: right-hand side of dq; methods that control the load, such as arc length, add to it.
         linear_iterations: number of linear iterations.
-        left: part of the right-hand side that may be left.
-        longest: part of it that may be taken at most; 1 unless the method knows better.
+        left: tolerance, relative to the right-hand side.
+        longest: upper bound of the step length; 1 unless the method sets it.
     """
 
     dq: PETSc.Vec
@@ -157,55 +157,55 @@ class ContactMethod(Protocol):
         """Begin a step, before the loop."""
 
     def place(self) -> None:
-        """Project the contactors where bodies and targets are now."""
+        """Project the contactors at the present positions of bodies and targets."""
 
     def return_to_targets(self, bound: float) -> bool:
-        """Normal return [UEM, 4.2]: put active contactors back onto the moved targets, unless that makes forces of a norm above ``bound``.
+        """Normal return [UEM, 4.2]: move active contactors back onto the moved targets, unless the resulting forces exceed ``bound``.
 
         Returns:
-            Whether any has been moved, by more than rounding of positions; contactors are projected again then.
+            Whether any contactor has been moved by more than rounding of positions; contactors are then projected again.
         """
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
-        """Where the contactors belong, the equations that follow, and, in equilibrium, the contact forces."""
+        """The targets of the contactors, their equations, and, in equilibrium, the contact forces."""
 
     def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
-        """The united matrix ``Q'KP`` and right-hand side of a state.
+        """The constrained matrix ``Q'KP`` and right-hand side of a state.
 
         Args:
-            state: P and Q.
-            iteration: number of the iteration that begins with it; None for another active set in the same one, whose tangents stay.
+            state: with P and Q.
+            iteration: number of the iteration that starts with it; None for another active set in the same iteration, which keeps K.
         """
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
-        """Solve a linearised problem, in the unknowns that contact asks for; ``complete`` tells the others.
+        """Solve a linearised problem, at least for the unknowns that contact needs; ``complete`` adds the others.
 
         Args:
             problem: the last one.
-            accuracy: part of the right-hand side that may be left.
-            near: unknowns to begin with, those of another active set or accuracy, or None.
+            accuracy: tolerance, relative to the right-hand side.
+            near: initial guess, from another active set or accuracy, or None.
         """
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
-        """The state in which contactors that ``step`` shows on the wrong side have changed sides; None if none is to change.
+        """The state with an active set changed where ``step`` violates the contact conditions; None if nothing changes.
 
-        Bodies and residual are those that the iteration began with. A ConvergenceError bounds the number of states.
+        Bodies and residual are unchanged since the beginning of the iteration. A ConvergenceError bounds the number of states.
         """
 
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
-        """The increment in all unknowns, if the last solve was of some."""
+        """The increment in all unknowns, if the last solve computed only some."""
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
-        """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``."""
+        """``Q'F`` of the last projection and the last assembled residual, with the active set of ``state``."""
 
     def end_step(self) -> None:
         """End a step in which the loop has converged; may refuse it."""
 
     def accelerate(self) -> None:
-        """Find the acceleration that the bodies start with, in dynamics."""
+        """Find the initial acceleration of the bodies, in dynamics."""
 
     def forget(self) -> None:
-        """Let the next step assemble and factorise anew, as the first of a run does."""
+        """Let the next step assemble and factorise anew, like the first step of a run."""
 
 
 def solve_united(
@@ -219,7 +219,7 @@ def solve_united(
     forces_before: Norm = 0.0,
     check_signals: Callable[[], None] | None = None,
 ) -> list[Iteration]:
-    """Iterate until ``Q'r`` vanishes against the forces at work and every contact condition holds.
+    """Iterate until ``Q'r`` is negligible relative to the forces at work and every contact condition holds.
 
     Args:
         bodies: without contact.
@@ -228,16 +228,16 @@ def solve_united(
         max_iterations: bound on the number of iterations.
         line_search: shorten steps that invert cells or increase the work of the residual.
         verbose: print a line per iteration.
-        forces_before: norm of the largest forces of earlier steps, against which those of a step that unloads may be rounding.
-        check_signals: called on all ranks after every linear solve; what it raises ends the loop.
+        forces_before: norm of the largest forces of earlier steps, relative to which the forces after unloading may be rounding.
+        check_signals: called on all ranks after every linear solve; an exception in it ends the loop.
 
     Returns:
         The history; its last entry is the converged state.
 
     Raises:
-        FloatingBodyError: if the residual stays and what is solved for grows, since nothing holds a body or a field.
-        ConvergenceError: after ``max_iterations``, where the residual runs away, or where an active set does not settle, with the history.
-        PrecisionError: if rounding hides whether the forces are in equilibrium.
+        FloatingBodyError: if the residual stagnates while its rounding grows above it, since nothing holds a body or a field.
+        ConvergenceError: after ``max_iterations``, if the residual diverges, or if the active set cycles, with the history.
+        PrecisionError: if the residual is below rounding, but too large relative to the forces.
         NotFiniteError: if the residual is NaN or infinite at the start of the step.
         InvertedElementError: if even the shortest step turns a cell inside out.
     """
@@ -250,12 +250,12 @@ def solve_united(
     norms, length = bodies.unknowns.norms, 1.0
 
     def rounding_of_all(rounding: Norm, times: int) -> Norm:
-        # a residual that has not fallen so often has met the rounding of laws that start from the deformation gradient
+        # a stagnating residual is at the rounding level of laws that use the deformation gradient
         more = np.where(stalled >= times, bodies.strain_rounding(), 0.0) if np.any(stalled >= times) else 0.0
         return np.maximum(np.maximum(rounding, left), more)
 
     def bounded(rounding: Norm, forces: Norm) -> Norm:
-        # what is not small beside forces is rounding of a displacement as large as the model, as at the start, or as conditions lead it
+        # a large rounding is bounded: by the forces, by its value at the start, and by rounding of displacements of the model's size
         if not np.any(rounding > within):
             return rounding
         of_model = FORCE_ROUNDING / np.finfo(float).eps * bodies.strain_rounding()
@@ -275,7 +275,7 @@ def solve_united(
         with _told(history):
             state = method.assemble_constraints(in_equilibrium)
         if k == 0:
-            # a displacement that comes back to nothing keeps the rounding of what it was
+            # a displacement that returns to zero keeps the rounding of its former size
             start, left, within = state.norm, np.minimum(state.rounding, rtol * forces_before), state.rounding
         forces = np.maximum(state.scale, start)
         if k > 0 and state.right and not state.changed and method.return_to_targets(rtol * first(forces)):
@@ -286,7 +286,7 @@ def solve_united(
         stalled = np.where(state.norm > STALLED * norm, stalled + 1, 0) if k > 0 and not state.changed else 0
         norm, rounding, small = state.norm, rounding_of_all(state.rounding, 2), rtol * forces
         if np.any((small < norm) & (norm <= rounding)) and (k > 0 or np.any(np.greater(forces_before, 0.0))):
-            # rounding excuses a residual that is small beside real forces, or where there are none: the first solve tells
+            # rounding is accepted if the residual is small relative to real forces, or without forces: only after the first solve
             real = np.maximum(bodies.above_rounding(state.in_contact), forces_before)
             excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), bounded(rounding, forces))
             small = np.where((small < norm) & (norm <= rounding), excused, small)
@@ -302,10 +302,10 @@ def solve_united(
                 raise no_precision(*worst(norm, rounding, real))
             if flown.any():
                 error = unheld(bodies, int(flown.argmax()), history[-1].residual)
-                # a shorter step may keep bodies in their contacts
+                # a shorter step may keep bodies in contact
                 raise ConvergenceError(str(error), history) if state.in_contact and bodies.config.moves else error
             break
-        # the residual that a step begins with knows nothing of conditions and gaps
+        # the residual at the beginning of a step does not include prescribed increments and gaps
         relative = ratio(norm, forces) if k > 0 else 1.0
         with _told(history):
             problem, step, solves, exchanges = _solve_linearised(method, state, k, rtol * first(forces), relative, check_signals)
@@ -326,7 +326,7 @@ def solve_united(
 
 @contextmanager
 def _told(history: list[Iteration]) -> Iterator[None]:
-    """Give the history to errors that do not know it."""
+    """Attach the history to convergence errors."""
     try:
         yield
     except ConvergenceError as error:
@@ -346,9 +346,9 @@ def _solve_linearised(
 
     Args:
         method: how contact is imposed.
-        state: to begin with.
+        state: initial state.
         iteration: number of this iteration.
-        wanted: norm of the residual that convergence asks for.
+        wanted: norm of the residual required for convergence.
         relative: residual over the forces at work.
         check_signals: see ``solve_united``.
 
@@ -359,7 +359,7 @@ def _solve_linearised(
     problem, near = method.linearise(state, iteration), None
     while True:
         accuracy = _accuracy(problem, iteration, wanted, relative)
-        # contactors that are wrong by far are told long before the solution is accurate
+        # a coarse solution already shows which contactors clearly violate their conditions
         loose = problem.iterative and problem.state.in_contact and accuracy < FORCING
         for left in (FORCING, accuracy) if loose else (accuracy,):
             step = method.solve(problem, left, near)
@@ -375,7 +375,7 @@ def _solve_linearised(
 
 
 def _accuracy(problem: LinearisedProblem, iteration: int, wanted: float, relative: float) -> float:
-    """Part of the right-hand side that a solve may leave."""
+    """Tolerance of a solve, relative to the right-hand side."""
     if problem.exact:
         return 0.0
     state, driving = problem.state, problem.rhs.norm()
@@ -385,7 +385,7 @@ def _accuracy(problem: LinearisedProblem, iteration: int, wanted: float, relativ
 
 
 def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, step: Increment, line_search: bool) -> float:
-    """Take the step, shortened where the displacement's forces ask for it, to where the next iteration begins: the length taken."""
+    """Take the step with a line search on the displacement's forces; returns the step length."""
     start, state, dq = bodies.displacement(), problem.state, step.dq
     work_of, norms = bodies.unknowns.work, bodies.unknowns.norms
     work, norm, length = abs(work_of(dq, step.rhs)), first(norms(step.rhs)), step.longest
@@ -411,7 +411,7 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
 
 
 def _moved(bodies: Bodies, method: ContactMethod, start: PETSc.Vec, step: Increment, length: float) -> bool:
-    """Displace the bodies, project the contactors and assemble the residual: whether it is finite, and no cell turned inside out."""
+    """Displace the bodies, project the contactors and assemble; whether the residual is finite and no cell is inverted."""
     bodies.displace(start, step.du, length)
     if bodies.inverted() is not None:
         return False
@@ -420,7 +420,7 @@ def _moved(bodies: Bodies, method: ContactMethod, start: PETSc.Vec, step: Increm
 
 
 def _downhill(bodies: Bodies, method: ContactMethod, state: IterationState, start: PETSc.Vec, step: Increment) -> float:
-    """Go on from a full step as long as forces still drive the bodies that way: the length taken, of 1, 2, 4 ... up to a bound."""
+    """Lengthen a full step while forces drive the bodies further in its direction; returns the length, of 1, 2, 4 ... up to a bound."""
     length, along = 1.0, partial(bodies.unknowns.work, step.dq)
     while length < LONGEST_SEARCH:
         if not _moved(bodies, method, start, step, 2.0 * length) or along(method.reduced_residual(state)) >= 0.0:
