@@ -1,6 +1,6 @@
-"""UFL forms that users hand over, looked at before they are compiled: arguments, spaces and meshes.
+"""Checks of UFL forms of users before compilation: arguments, spaces and meshes.
 
-A form of another mesh or space would be assembled with the numbers of other nodes, or beyond the end of arrays.
+A form on another mesh or space would be assembled with wrong node numbers, or beyond the end of arrays.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from ufl.differentiation import CompoundDerivative, Derivative
 from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError, SpaceError
 
-#: Signatures of forms in which every term was found to hold all arguments once.
+#: Signatures of forms in which every term contains all arguments once.
 _with_all_arguments: set[str] = set()
-#: What a functional may be differentiated by.
+#: Types that a functional may be differentiated by.
 Control: TypeAlias = fem.Constant | fem.Function | ufl.SpatialCoordinate
 
 
 def check_linear(what: str, form: Any, V: Any) -> None:
-    """Refuse what is no form linear in a test function of a space, on its mesh.
+    """Refuse anything but a form that is linear in a test function of a space, on its mesh.
 
     Args:
-        what: it is, for messages.
-        form: handed over.
+        what: name of the form in messages.
+        form: object to check.
         V: the displacement's space.
 
     Raises:
-        InputTypeError, InputError, SpaceError: each with the remedy.
+        InputTypeError, InputError, SpaceError: each with a remedy.
     """
     arguments = _arguments(what, form, V.mesh, "not linear in its test function", "every term to hold the test function once")
     if not arguments:
@@ -52,14 +52,14 @@ def check_linear(what: str, form: Any, V: Any) -> None:
 
 
 def check_functional(what: str, form: Any, domain: Any = None) -> None:
-    """Refuse what is no functional, as an energy, on a mesh; None takes the mesh of its first integral; raises as ``check_linear``."""
+    """Refuse anything but a functional on a mesh (None: the mesh of its first integral); raises as ``check_linear``."""
     arguments = _arguments(what, form, domain, "no functional", "no test function, or every term to hold it")
     if arguments:
         raise InputError(f"{what} has {len(arguments)} argument(s): expected a functional, without test function; leave it out")
 
 
 def _arguments(what: str, form: Any, domain: Any, fault: str, expected: str) -> Any:
-    """Arguments of a form of a mesh in which every term holds all of them once."""
+    """Arguments of a form on a mesh; every term must contain all of them once."""
     if not isinstance(form, ufl.Form):
         remedy = "integrate it: multiply it by ufl.dx" if isinstance(form, Expr) else "write it with ufl, and do not compile it"
         given.kind(what, form, False, "a UFL form", remedy)
@@ -69,24 +69,24 @@ def _arguments(what: str, form: Any, domain: Any, fault: str, expected: str) -> 
         arguments, alike = form.arguments(), form.signature()
         if alike in _with_all_arguments:
             return arguments
-        # gradients are linear, and take longer to be expanded than all the rest
+        # expansion of gradients, which are linear, is the slowest part and is avoided if possible
         if not (_is_expanded(form) and _holds_once(apply_algebra_lowering(form), arguments)):
-            # as form compilers do: the conj of ufl.inner is none of a real form
+            # as in form compilers: conj of ufl.inner has no effect in a real form
             check_form_arity(remove_complex_nodes(ufl.algorithms.expand_derivatives(form)), arguments)
-    except (Exception, ArityMismatch) as error:  # of which class depends on the version of UFL
+    except (Exception, ArityMismatch) as error:  # its class depends on the version of UFL
         raise InputError(f"{what} is {fault} ({error}): expected {expected}") from error
     _with_all_arguments.add(alike)
     return arguments
 
 
 def _is_expanded(form: ufl.Form) -> bool:
-    """Whether a form holds no derivatives but those in space."""
+    """Whether all derivatives in a form are derivatives in space."""
     parts = chain.from_iterable(unique_pre_traversal(integral.integrand()) for integral in form.integrals())
     return not any(isinstance(part, Derivative) and not isinstance(part, CompoundDerivative) for part in parts)
 
 
 def _holds_once(form: ufl.Form, arguments: Any) -> bool:
-    """Whether every term holds all arguments once, as far as that is seen before gradients are expanded."""
+    """Whether every term contains all arguments once, as far as this can be decided without expanding gradients."""
     try:
         check_form_arity(remove_complex_nodes(form), arguments)
     except (Exception, ArityMismatch):
@@ -95,10 +95,10 @@ def _holds_once(form: ufl.Form, arguments: Any) -> bool:
 
 
 def _check_mesh(what: str, form: Any, domain: Any = None) -> None:
-    """Refuse a form over another mesh, or with Functions, places or tags of one; None takes the mesh of its first integral.
+    """Refuse a form with integrals, Functions, coordinates or tags of another mesh; None takes the mesh of its first integral.
 
     Raises:
-        SpaceError: naming what is of another mesh.
+        SpaceError: names the object of another mesh.
     """
     own = None if domain is None else domain.ufl_domain()
     for integral in form.integrals():
@@ -112,7 +112,7 @@ def _check_mesh(what: str, form: Any, domain: Any = None) -> None:
 
 
 def check_expression(what: str, expression: Any, own: Any, mesh: str) -> None:
-    """Refuse a UFL expression with Functions or places of another domain than ``own``, that of ``mesh`` in words, by a SpaceError."""
+    """Raise a SpaceError for a UFL expression with Functions or coordinates of another domain than ``own``, ``mesh`` in words."""
     for part in ufl.corealg.traversal.traverse_unique_terminals(expression):
         if any(other != own for other in ufl.domain.extract_domains(part)):
             held = f"'{part.name}'" if isinstance(part, fem.Function) else given.described(part)
@@ -120,14 +120,14 @@ def check_expression(what: str, expression: Any, own: Any, mesh: str) -> None:
 
 
 def check_values(what: str, expression: Any, own: Any, mesh: str) -> None:
-    """Refuse a UFL expression without values, which holds a test or trial function, by an InputError, and as ``check_expression``."""
+    """Raise an InputError for a UFL expression with a test or trial function; otherwise check as ``check_expression``."""
     if any(isinstance(part, ufl.Argument) for part in ufl.corealg.traversal.traverse_unique_terminals(expression)):
         raise InputError(f"{what} holds a test or trial function: expected values alone; put a Function in its place")
     check_expression(what, expression, own, mesh)
 
 
 def check_parts(what: str, form: ufl.Form, u: fem.Function) -> None:
-    """Refuse a form of ``u.sub(i)``, of which derivatives by u would know nothing, by an InputError."""
+    """Raise an InputError for a form with ``u.sub(i)``, which UFL does not differentiate by u."""
     for f in form.coefficients():
         if f is not u and isinstance(f, fem.Function) and np.may_share_memory(f.x.array, u.x.array):
             raise InputError(
@@ -140,7 +140,7 @@ def _mesh(domain: Any) -> str:
 
 
 def takes_values(form: ufl.Form, u: Any) -> bool:
-    """Whether a form takes values of u, not of its derivatives alone, as springs do."""
+    """Whether a form contains u itself, not only its derivatives, e.g. in springs."""
     seen: set[int] = set()
     kept = ufl.algorithms.expand_derivatives(form)
     todo = [integral.integrand() for integral in kept.integrals()]

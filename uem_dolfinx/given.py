@@ -1,6 +1,6 @@
-"""What users hand over, looked at before it is used: numbers, words, vectors, lists, functions; and the same on all ranks.
+"""Checks of arguments of users: numbers, words, vectors, lists, functions, and agreement between ranks.
 
-Every check names the thing, its value, what was expected and, where that is not plain, what to do.
+Every message contains the name of the argument, its value, the expected values and, if it is not obvious, a remedy.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from uem_dolfinx.errors import InputError, InputTypeError
 #: Values are shown with so many letters.
 #: [format; letters; -]
 LONGEST = 80
-#: What the names of the package's modules begin with.
+#: Prefix of the names of the package's modules.
 #: [format; -; -]
 PACKAGE = "uem_dolfinx."
 
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers that will do, what they are called, and what to do about others."""
+    """A range of numbers, its description in words, and a remedy for other numbers."""
 
     words: str
     holds: Callable[[Any], Any]  # of a number or an array of them
@@ -45,7 +45,7 @@ NOT_NEGATIVE = Range("0 or a positive number", lambda x: (x >= 0) & np.isfinite(
 
 
 def between(low: float, high: float, remedy: str = "") -> Range:
-    """Numbers between two bounds, which do not belong to them."""
+    """The open interval between two bounds."""
     return Range(f"a number between {low:g} and {high:g}", lambda x: (low < x) & (x < high), remedy)
 
 
@@ -60,7 +60,7 @@ def described(value: object) -> str:
 
 
 def shown(value: object) -> str:
-    """A value in a message, in short."""
+    """A value, shortened for a message."""
     text = described(value)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]} ..."
 
@@ -90,7 +90,7 @@ def number(what: str, value: Any, within: Range = FINITE) -> float:
 
 
 def length(what: str, value: Any, none: str = "") -> float:
-    """A positive finite length; ``none`` says what None would do where it is allowed; raises as ``number`` does."""
+    """A positive finite length; ``none`` describes the effect of None if it is allowed; raises as ``number`` does."""
     words = "a positive length" + (f", or None {none}" if none else "")
     return number(what, value, Range(words, POSITIVE.holds))
 
@@ -102,7 +102,7 @@ def count(what: str, value: Any, remedy: str = "") -> int:
 
 
 def part_number(what: str, value: Any, of: str) -> int:
-    """Number of the part of a mixed space that is ``of`` something; InputTypeError for no whole number, InputError below 0."""
+    """Number of a part of a mixed space, ``of`` in words; InputTypeError unless a whole number, InputError below 0."""
     expected = f"the number of the part of the mixed space that is {of}, counted from 0"
     kind(what, value, isinstance(value, (int, np.integer)) and not isinstance(value, bool), expected)
     if value < 0:
@@ -118,7 +118,7 @@ def flag(what: str, value: Any) -> bool:
 
 
 def did_you_mean(value: Any, known: Collection[str], otherwise: str = "") -> str:
-    """Asks for the word known here that resembles a value; ``otherwise`` if none does."""
+    """A hint with the known word most similar to a value; ``otherwise`` if no word is similar."""
     import difflib
 
     near = difflib.get_close_matches(str(value), known, n=1)
@@ -126,7 +126,7 @@ def did_you_mean(value: Any, known: Collection[str], otherwise: str = "") -> str
 
 
 def word(what: str, value: Any, known: Sequence[str]) -> str:
-    """One of the words known here; InputError for others, InputTypeError for what is no word."""
+    """One of the known words; InputError for other words, InputTypeError for other types."""
     if not isinstance(value, str) or value not in known:
         some = " or ".join(filter(None, [", ".join(map(repr, known[:-1])), repr(known[-1])]))
         error = InputError if isinstance(value, str) else InputTypeError
@@ -147,7 +147,7 @@ def vector(what: str, value: npt.ArrayLike, size: int | None = None) -> Array:
 
     Raises:
         InputTypeError: if they are no numbers.
-        InputError: if there are more or less of them, or one is not finite.
+        InputError: if their number is wrong, or one is not finite.
     """
     expected = f"{'2 or 3' if size is None else size} finite numbers"
     try:
@@ -163,9 +163,9 @@ def vector(what: str, value: npt.ArrayLike, size: int | None = None) -> Array:
 
 
 def direction(what: str, value: npt.ArrayLike, size: int | None = None) -> Array:
-    """A vector of length one along a given one; raises as ``vector`` does, and InputError if it has no length."""
+    """The unit vector along a given vector; raises as ``vector`` does, and InputError for a zero vector."""
     a = vector(what, value, size)
-    # hypot neither overflows nor underflows where squares would
+    # scaled by the largest entry, so that squares neither overflow nor underflow
     largest = np.abs(a).max()
     if not largest > 0:
         raise InputError(sentence(what, value, "a direction", "give a non-zero vector"))
@@ -174,14 +174,14 @@ def direction(what: str, value: npt.ArrayLike, size: int | None = None) -> Array
 
 
 def kind(what: str, value: Any, fits: bool, expected: str, remedy: str = "") -> Any:
-    """The value if it fits what is expected; InputTypeError if not."""
+    """The value if ``fits``; otherwise an InputTypeError."""
     if not fits:
         raise InputTypeError(sentence(what, value, expected, remedy))
     return value
 
 
 def items(what: str, value: Any, fits: Callable[[Any], bool], one: str) -> list[Any]:
-    """A list of things that are each ``one`` of a kind, as ``"a Dirichlet condition"``; InputTypeError for anything else."""
+    """A list of items of one kind, ``one`` in words, e.g. ``"a Dirichlet condition"``; InputTypeError for anything else."""
     if not isinstance(value, Sequence) or isinstance(value, (str, bytes)):
         remedy = f"put it in brackets: {what}=[...]" if fits(value) else f"each item must be {one}"
         raise InputTypeError(sentence(what, value, "a list", remedy))
@@ -191,16 +191,16 @@ def items(what: str, value: Any, fits: Callable[[Any], bool], one: str) -> list[
 
 
 def plain(value: Any) -> Any:
-    """A value in which arrays are lists, and Constants what they are now."""
+    """A value with arrays converted to lists, and Constants replaced by their present values."""
     value = getattr(value, "value", value)
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
-    """Refuse values that differ from rank to rank, which would have the ranks wait for each other for ever (collective).
+    """Refuse values that differ between ranks, which would cause a deadlock (collective).
 
     Raises:
-        InputError: on all ranks, naming the first such value and two ranks.
+        InputError: on all ranks, with the first such value and two ranks.
     """
     if comm.size == 1:
         return
@@ -215,17 +215,17 @@ def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
 
 
 class Sealed:
-    """A public object that, once it is made, refuses attributes that there are not, and arguments that count no more.
+    """A public object that, once made, refuses to set unknown attributes, and arguments that no longer have an effect.
 
     Attributes:
-        SETTABLE: arguments that may be set anew at any time, each with what checks a value and returns it, None for nothing.
+        SETTABLE: arguments that may be set at any time, each with a function that checks and returns the value, or None.
     """
 
     SETTABLE: ClassVar[Mapping[str, Callable[[Any], Any] | None]] = {}
     _made = False
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Have the outermost ``__init__`` of an object seal it."""
+        """Seal an object at the end of its outermost ``__init__``."""
         super().__init_subclass__(**options)
         init = cls.__dict__.get("__init__")
         if init is None:
@@ -241,17 +241,17 @@ class Sealed:
 
     @property
     def _called(self) -> str:
-        """What it is called in messages."""
+        """Its name in messages."""
         own, kind = self.__dict__.get("name"), type(self).__name__
         return f"the {kind} {own!r}" if isinstance(own, str) else f"a {kind}"
 
     @property
     def _is_open(self) -> bool:
-        """Whether arguments may still be set, as nothing has been made of it."""
+        """Whether arguments may still be set, because the object is not in use yet."""
         return False
 
     def _too_late(self) -> str:
-        """Why arguments count no more, and what to do."""
+        """Message that arguments no longer have an effect, with the remedy."""
         kind, more = type(self).__name__, " or ".join(self.SETTABLE)
         whole = "" if kind == "UnitedProblem" else ", and a new problem of it"
         return f"counts only as an argument: make a new {kind}{whole}" + (f"; only {more} may be set" if more else "")
@@ -260,9 +260,9 @@ class Sealed:
         """Set an attribute.
 
         Raises:
-            InputError: for one that there is not, or one that comes too late.
+            InputError: if it is unknown, or an argument that can no longer be changed.
         """
-        # the package's own lines set what they need
+        # code of the package may set all attributes
         if self._made and not name.startswith("_") and not sys._getframe(1).f_globals.get("__name__", "").startswith(PACKAGE):
             if name in self.SETTABLE:
                 check = self.SETTABLE[name]
@@ -272,14 +272,14 @@ class Sealed:
         super().__setattr__(name, value)
 
     def _refuse(self, name: str, value: Any) -> None:
-        """Raise where an attribute is none, is computed, or comes too late."""
+        """Raise if an attribute is unknown, computed, or an argument that can no longer be changed."""
         kind: Any = type(self)
         arguments = arguments_of(kind)
         there = inspect.getattr_static(self, name, None)
         computed = isinstance(there, property) and there.fset is None
         if name in arguments and not self._is_open and not computed:
             raise InputError(f"{self._called}: {name} = {shown(value)} {self._too_late()}")
-        # classes that others derive are their own, and a single letter, which is no misspelt word, is a note of the script's
+        # classes derived by users may have further attributes; a single letter is no misspelt word, but an attribute of the script
         own = name in self.__dict__ or len(name) == 1 or not kind.__module__.startswith(PACKAGE)
         if computed or (there is None and not own):
             known = sorted({*self.SETTABLE, *(n for n in arguments if self._is_open and n in self.__dict__)})
@@ -289,7 +289,7 @@ class Sealed:
 
 @cache
 def arguments_of(kind: Any) -> tuple[str, ...]:
-    """Names of the arguments that a class and those that it derives from are made with."""
+    """Names of the arguments of the constructors of a class and its base classes."""
     names: dict[str, None] = {}
     for one in kind.__mro__:
         if "__init__" in one.__dict__ and one is not object:

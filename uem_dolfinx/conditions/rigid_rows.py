@@ -1,11 +1,11 @@
-"""Rigid motion of a set of nodes as uniting equations, linearised where the set is now.
+"""Rigid motion of a set of nodes as constraint equations, linearised at the present placement of the set.
 
-A motion z of shift and turn takes node i to ``u_i = u*_i + A_i z`` from the nearest rigid place u*. As many components q of nodes of the
-set as z has, less those that are prescribed, are left; with B the rows of A that they are, and C those of the prescribed motion,
+A rigid motion z (translation and rotation) moves node i to ``u_i = u*_i + A_i z`` from the nearest rigid placement u*. The set keeps as
+many components q as z has components that are not prescribed. With B the rows of A at q, and C the rows of the prescribed motion,
 
     z = (B; C)^-1 (q - u*_q; h - h*)
 
-and every other component follows them. Components with Dirichlet conditions are among q before others, which are far from each other.
+and every other component follows. q contains components with Dirichlet conditions first, then components far from each other.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ TOLD_WORSE = 0.5
 
 @dataclass(frozen=True)
 class Basis:
-    """Components that are left of a set, known to all ranks.
+    """Components q that a set keeps, the same on all ranks.
 
     Attributes:
         node: global nodes ``(k,)``.
         component: of each ``(k,)``.
-        X: the nodes in the drawing ``(k, gdim)``.
-        told: least singular value of their rows with those of the prescribed motion when they were chosen.
-        halo: asks their owners.
+        X: positions of the nodes in the reference configuration ``(k, gdim)``.
+        told: smallest singular value of their rows and the rows of the prescribed motion, when they were chosen.
+        halo: fetches values from the owners.
     """
 
     node: Ints
@@ -57,24 +57,24 @@ class Basis:
 
     @cached_property
     def nodes(self) -> tuple[Ints, Ints]:
-        """Each node once, ascending, and the place of each component's among these ``(k,)``."""
+        """Distinct nodes, ascending, and the index of each component's node among them ``(k,)``."""
         nodes, which = np.unique(self.node, return_inverse=True)
         return nodes, which
 
 
 class RigidRows:
-    """Uniting equations of one coupling (collective).
+    """Constraint equations of one coupling (collective).
 
     Args:
         config: configuration of the displacement.
         coupling: attached.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
-        avoided: owned nodes of contacts, which are eliminated rather than left ``(n_owned,)``.
+        avoided: mask of owned nodes of contacts, which are preferably eliminated ``(n_owned,)``.
         loaded: Constants that the load sets.
 
     Attributes:
-        equations: of this rank, one for each component of its nodes, with the gaps of the last call of ``at_present``; those of
-            components that are left or prescribed do not hold.
+        equations: of this rank, one for each component of its nodes, with the gaps of the last call of ``at_present``; inactive for
+            components in q and for prescribed components.
     """
 
     def __init__(
@@ -88,20 +88,20 @@ class RigidRows:
         self._ramped = coupling.ramped(loaded)
         self._wanted = coupling.wanted()
         self._basis: Basis | None = None
-        #: Displacement at which the ramp began, and the motion there.
+        #: Displacement at the beginning of the ramp, and its rigid motion.
         self._start: tuple[Array, Array] | None = None
-        #: Rotation there, of a run that goes on from a checkpoint ``(n_turns,)``.
+        #: Rotation there, for a run restarted from a checkpoint ``(n_turns,)``.
         self._began: Array | None = None
         self.at_present()
 
     # -- steps -------------------------------------------------------------------------------------------------------------
 
     def begin_step(self, start: Array, fraction: float) -> None:
-        """Begin a step whose ramp began at a displacement of the owned nodes ``(n_owned, gdim)`` and goes so far (collective)."""
+        """Begin a step at a fraction of a ramp that started at a displacement of the owned nodes ``(n_owned, gdim)`` (collective)."""
         held, wanted = list(self.coupling.prescribed), self.coupling.wanted()
         own = start[self.set.nodes]
         if self._start is None or reduced(self._config.comm, int(not np.array_equal(own, self._start[0]))):
-            # steps of one ramp count turns from the same
+            # all steps of a ramp count rotations from its start
             self._start, self._began = (own.copy(), self.coupling.motion_of(start, self._began)), None
         began = self._start[1][held]
         self._wanted = np.where(self._ramped, began + fraction * (wanted - began), wanted) if fraction < 1.0 else wanted
@@ -109,7 +109,7 @@ class RigidRows:
 
     @property
     def turns(self) -> list[list[float]]:
-        """Rotations that tell the number of turns, now and where the ramp began: what a checkpoint keeps."""
+        """Rotations with their number of full turns, now and at the beginning of the ramp, for a checkpoint."""
         now = self.coupling.turns
         return [now.tolist(), now.tolist() if self._start is None else self._start[1][self._config.gdim :].tolist()]
 
@@ -119,7 +119,7 @@ class RigidRows:
         self._start = None
 
     def place(self) -> None:
-        """Put the nodes where the nearest finite rigid motion takes them; components with Dirichlet conditions stay (collective)."""
+        """Move the nodes to the nearest finite rigid placement, except components with Dirichlet conditions (collective)."""
         if not self.set.large:
             return
         u, nodes = self._config.displacement[: self._config.n_owned], self.set.nodes
@@ -127,10 +127,10 @@ class RigidRows:
         self._config.shift(nodes, np.where(self._free, way, 0.0))
 
     def end_step(self) -> None:
-        """Remember the number of turns, and refuse Dirichlet values that no rigid motion has (collective).
+        """Store the number of turns, and refuse Dirichlet values that no rigid motion satisfies (collective).
 
         Raises:
-            ConflictError: naming the place.
+            ConflictError: names the position.
         """
         config, eq = self._config, self.at_present()
         shift = config.gdim
@@ -153,7 +153,7 @@ class RigidRows:
     # -- rows --------------------------------------------------------------------------------------------------------------
 
     def _aim(self) -> tuple[Placement, Array, Array]:
-        """Where rows are linearised, rows C of the prescribed motion ``(k, n_z)``, and what they lack ``(k,)`` (collective)."""
+        """Placement for linearisation, rows C of the prescribed motion ``(k, n_z)``, and their residuals ``(k,)`` (collective)."""
         s, g, held = self.set, self._config.gdim, list(self.coupling.prescribed)
         n_turns = 1 if g == 2 else 3
         if not s.large:
@@ -163,7 +163,7 @@ class RigidRows:
             turn = nearest_turn(at.turn, self.coupling.turns)
             known = [self._wanted[held.index(i)] for i in range(g, g + n_turns) if i in held]
             if len(known) == n_turns:
-                # the rows are exact where the turn is known
+                # with a prescribed rotation the rows are exact
                 turn = np.array(known)
                 at = Placement(Motion(at.motion.translation, rotation_matrix(turn), at.motion.about))
         C = np.zeros((g + n_turns, g + n_turns))
@@ -205,7 +205,7 @@ class RigidRows:
 
     @property
     def eliminated(self) -> Bools:
-        """Components of the nodes that the equations eliminate ``(n, gdim)``."""
+        """Mask of the components that the equations eliminate ``(n, gdim)``."""
         return self._free & ~self._left
 
     def rewritten(self, equations: UnitingEquations) -> UnitingEquations:

@@ -1,6 +1,6 @@
-"""Derivatives at a state of equilibrium with contact: of functionals by one adjoint solve, of displacement and pressures by one forward.
+"""Derivatives at an equilibrium with contact: of functionals by one adjoint solve, of displacement and pressures by one forward solve.
 
-The active set is that of the state: where a contactor has neither force nor gap, J has a gradient on either side, and this is one of them.
+The active set of the state is kept. If a contactor has neither force nor gap, J has two one-sided gradients; one of them is returned.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from uem_dolfinx.solve.united.system import BodySystem
 
 #: Fields of contacts, by the words in their names.
 RESULTS = ("active", "force", "gap", "pressure", "slip", "status", "traction")
-#: In words, what a functional may be differentiated by.
+#: Kinds of controls, in words.
 A_CONTROL = "a Constant, a Function, ufl.SpatialCoordinate(mesh) or a ContactParameter"
 AnyControl: TypeAlias = Control | ContactParameter
 
@@ -37,28 +37,28 @@ AnyControl: TypeAlias = Control | ContactParameter
 def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl] | AnyControl) -> list[Array | fem.Function]:
     """Derivatives of a functional at the present equilibrium by parameters of the problem, by one adjoint solve (collective).
 
-    Exact for the discrete problem: the contact conditions are eliminated, not smoothed. With mortar on facets of hexahedra that warp
-    (by the shape: refused), and on curved rigid surfaces, it is as exact as Newton's tangent. The state is left as it is.
+    Exact for the discrete problem: contact conditions are eliminated, not smoothed. With mortar on warped facets of hexahedra (the shape
+    as control is refused), and on curved rigid surfaces, it is as exact as Newton's tangent. The state is unchanged.
 
     Args:
         problem: in statics, without friction, heat through contacts and laws with history; its last step is the state.
         J: functional of ``problem.u``, of the ``pressure`` of the problem's contacts and of the controls, a UFL form without test
-            functions. Among other fields ``problem.u`` is the mixed Function, and J holds parts of ``ufl.split(problem.u)``. The force
-            with which Dirichlet conditions hold a part, or that contacts exert on one, is a functional of ``problem.u``:
+            functions. For mixed problems ``problem.u`` is the mixed Function, and J contains parts of ``ufl.split(problem.u)``. The
+            reaction of Dirichlet conditions, or the force of contacts, on a part is a functional of ``problem.u``:
             ``ufl.replace(F, {v: w})`` with a Function w that is a unit vector at the part's nodes, 0 elsewhere.
-        controls: Constants and Functions that F, J or the values of Dirichlet conditions are made of: moduli, loads, fields of moduli,
-            prescribed displacements. A Function is taken by its degrees of freedom; ``ufl.SpatialCoordinate(mesh)`` stands for the places
-            of the nodes: the shape; a ``ContactParameter`` is the offset of a contact, or the place or the turn of its rigid target.
+        controls: Constants and Functions in F, J or the values of Dirichlet conditions: moduli, loads, fields of moduli, prescribed
+            displacements. The entries of a Function are its degrees of freedom. ``ufl.SpatialCoordinate(mesh)`` is the shape: the
+            positions of the nodes. A ``ContactParameter`` is the offset of a contact, or the position or rotation of its rigid target.
 
     Returns:
-        For every control, in their order, the derivatives by its entries: an array of the shape of a Constant's value or a parameter, a
-        Function of the control's space, or for the shape one of the displacement's space.
+        For every control, in the same order, the derivatives by its entries: an array of the shape of a Constant's value or a parameter,
+        a Function of the control's space, or for the shape a Function of the displacement's space.
 
     Raises:
-        InputError, InputTypeError: for a problem whose gradient needs the history of all steps, one without a step, one without the
-            consistent tangent, one whose parameters have changed since the last step, or what is no functional or no control of this
-            problem; for a J of the pressures of contactors in concave corners of the target, or of those whose equations conflict.
-        LinearSolveError: if the united matrix is singular.
+        InputError, InputTypeError: if the gradient depends on the history of all steps, if the problem has no step or no consistent
+            tangent, or if its parameters have changed since the last step; for an object that is no functional or no control of this
+            problem; for a J with pressures of contactors in concave corners of the target, or of contactors with conflicting equations.
+        LinearSolveError: if the constrained matrix is singular.
     """
     check_problem(problem, recorded=False)
     some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
@@ -77,14 +77,14 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
 
 
 def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]], of: fem.Function | None = None) -> fem.Function:
-    """How the displacement, or a contact pressure, changes with parameters of the problem, by one solve (collective).
+    """Directional derivative of the displacement, or of a contact pressure, by parameters of the problem, by one solve (collective).
 
-    With other fields the result contains all of them, as one Function of the mixed space.
+    For mixed problems the result contains all fields, as one Function of the mixed space.
 
     Args:
-        problem: as of :func:`gradient`.
-        direction: pairs of a control, as of :func:`gradient`, and its change: for a Constant or a parameter of a contact an array of its
-            shape, for a Function one of its space, for the places of the nodes one of the displacement's space.
+        problem: as in :func:`gradient`.
+        direction: pairs of a control, as in :func:`gradient`, and its change: for a Constant or a parameter of a contact an array of its
+            shape, for a Function a Function of its space, for the shape a Function of the displacement's space.
         of: the ``pressure`` of a contact of the problem; None for the displacement.
 
     Returns:
@@ -115,18 +115,18 @@ def taylor_test(
     """Order with which ``|J(h) - J(0) - h slope|`` vanishes with h: 2 if ``slope`` is the derivative of J, else 1 (collective).
 
     Args:
-        functional: J(h), as of controls that have been changed by h in one direction and a problem that was solved anew with them.
-        slope: the derivative of J by h at 0, as from :func:`gradient`.
+        functional: J(h), for instance after a change of controls by h in one direction and a new solution of the problem.
+        slope: the derivative of J by h at 0, for instance from :func:`gradient`.
         size: the first h, a positive number.
-        halvings: how often it is halved.
+        halvings: number of halvings of h.
         comm: communicator of the ranks that call this: an error on one of them is raised on all.
 
     Returns:
-        The least order of all halvings.
+        The smallest order of all halvings.
 
     Raises:
         InputTypeError: if J is no number.
-        InputError: if ``size`` is not positive, or J or the slope is not finite, or nothing is left of J at some h, which has no order.
+        InputError: if ``size`` is not positive, if J or the slope is not finite, or if the remainder is zero at some h.
         UserFunctionError: if the functional raises an error.
     """
     given.kind("functional", functional, callable(functional), "a function of h that returns a number")
@@ -156,7 +156,7 @@ def taylor_test(
 
 
 def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
-    """Refuse problems whose equations do not tell derivatives, and those of all steps unless they are ``recorded`` (collective)."""
+    """Refuse problems without derivatives, and path-dependent problems unless they are ``recorded`` (collective)."""
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
         if recorded or not problem.config.moves:
@@ -198,12 +198,12 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             raise InputError("gradients do not support equations, forces and springs of nodes: expected a problem without them")
     from uem_dolfinx.solve.steps.parted import part_contacts
 
-    # derivatives are known of each contact
+    # derivatives are implemented for single contacts
     part_contacts(problem)
 
 
 def refuse_kept_projections(problem: UnitedProblem, steps: int) -> None:
-    """Refuse contacts that were projected where a step before the last ended, of which there is no derivative."""
+    """Refuse contacts with projections from earlier steps than the last, whose derivatives are not available."""
     for contact in problem.contacts:
         if steps > 1 and contact.sliding == "small":
             raise InputError(
@@ -213,7 +213,7 @@ def refuse_kept_projections(problem: UnitedProblem, steps: int) -> None:
 
 
 def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
-    """Refuse problems without a step, and what are not controls or pairs with their changes (collective)."""
+    """Refuse problems without a step, and items that are no controls or no pairs of a control and its change (collective)."""
     with agreed(problem.comm):
         if not problem.progress.steps:
             raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
@@ -241,7 +241,7 @@ def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
 
 
 def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
-    """The contacts whose pressures J holds; refuse other results of contacts, and those of other problems (collective)."""
+    """The contacts whose pressures J contains; refuse other results of contacts, and results of other problems (collective)."""
     results = [f for f in J.coefficients() if _is_result(f)]
     pressures = [contact.pressure for contact in problem.contacts] if results else []
     copies = problem.config.functions().values() if problem.config.unknowns.mixed else []
@@ -261,7 +261,7 @@ def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
 
 
 def refuse_without_state(problem: UnitedProblem, functionals: Sequence[ufl.Form], state: Sequence[fem.Function]) -> None:
-    """Refuse functionals none of which holds what the problem solves for (collective)."""
+    """Refuse functionals if none of them contains a Function in ``state``, the unknowns of the problem (collective)."""
     with agreed(problem.comm):
         if not any(f is one for J in functionals for f in J.coefficients() for one in state):
             raise InputError(
@@ -273,7 +273,7 @@ def refuse_without_state(problem: UnitedProblem, functionals: Sequence[ufl.Form]
 def refuse_idle_controls(
     problem: UnitedProblem, what: str, controls: Sequence[Any], functionals: Sequence[ufl.Form] = ()
 ) -> None:
-    """Refuse Constants and Functions that neither the problem nor a functional is made of (collective)."""
+    """Refuse Constants and Functions that occur neither in the problem nor in a functional (collective)."""
     forms, beside = [problem.bodies.F, *functionals], [problem.dynamics, problem.materials]
     n, bcs = len(problem.u.x.array), problem.bodies.bcs
     for i, m in enumerate(controls):
@@ -307,7 +307,7 @@ def _is_pair(one: Any) -> bool:
 
 
 def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> None:
-    """Refuse parameters that the problem's equations do not depend on as they stand."""
+    """Refuse parameters on which the problem does not depend, or by which there are no derivatives."""
     known = any(contact is m.contact for contact in problem.contacts)
     given.kind(what, m, known, "a parameter of a contact of the problem")
     if m.parameter == "friction" and not m.contact.pair.frictional:
@@ -328,7 +328,7 @@ def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> 
 
 
 def _check_change(problem: UnitedProblem, what: str, control: AnyControl, change: Any) -> None:
-    """Refuse a change that is not of the kind of its control."""
+    """Refuse a change whose type, shape or space differs from its control."""
     if not isinstance(control, (fem.Function, ufl.SpatialCoordinate)):
         shape = np.shape(control.value) if isinstance(control, fem.Constant) else control.shape(problem.config.gdim)
         try:
@@ -350,7 +350,7 @@ def _check_change(problem: UnitedProblem, what: str, control: AnyControl, change
 
 
 def _check_shape(problem: UnitedProblem) -> None:
-    """Refuse problems whose nodes are not those that tell the shape."""
+    """Refuse problems that have no gradient by the shape."""
     config = problem.config
     if compat.geometry_dofs(config.mesh).shape[1] != compat.cell_dofs(config.V).shape[1]:
         raise InputError("a gradient by the shape needs cells of the displacement's degree: straight ones for degree 1")

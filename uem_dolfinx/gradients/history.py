@@ -1,6 +1,6 @@
-"""Gradients of functionals of all steps: committed steps are kept, and swept backwards, each by one adjoint problem, as in ``sweep``.
+"""Gradients of functionals of all steps: committed steps are recorded and swept backwards, with one adjoint problem each, see ``sweep``.
 
-Which contactors touch, stick and slip, which points yield, and the number and lengths of steps, are those that were found.
+The active set, sticking and slipping, yielding points, and the number and lengths of steps are kept as recorded.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class History(given.Sealed):
     """All steps that a problem takes while it is recorded, see :func:`recording`.
 
     Args:
-        problem: whose steps are kept.
+        problem: whose steps are recorded.
         folder: for a scratch file of each rank; None keeps them in memory.
     """
 
@@ -54,13 +54,13 @@ class History(given.Sealed):
         self.problem = problem
         self._first = problem.progress.steps
         self._records = Records(folder)
-        #: What tells the places of the nodes in each step from others.
+        #: Digest of the positions of the nodes in each step.
         self._places: list[bytes] = []
-        #: What a motion begins with; None in statics.
+        #: Initial state of a motion; None in statics.
         self._start: Record | None = None
-        #: What steps have led, so that it keeps its id.
+        #: Constants and contacts ramped by steps, referenced here so that their ids stay unique.
         self._led: list[Any] = []
-        #: Laws with history, of which there are slopes.
+        #: Laws with history that have derivatives.
         self._laws: list[Any] = problem.materials
         F = problem.bodies.F
         known = (f for f in F.coefficients() if f is not problem.u and material_of(f) is None)
@@ -71,11 +71,11 @@ class History(given.Sealed):
         return len(self._records)
 
     def __repr__(self) -> str:
-        """How many steps it has."""
+        """Its number of steps."""
         return f"History({len(self)} steps)"
 
     def note(self, before: Memory, arc: bool) -> None:
-        """Keep the step that the problem is about to commit, in place of the last one if that is taken again."""
+        """Record the step that the problem is about to commit; a repeated step replaces the last record."""
         problem = self.problem
         if arc:
             raise InputError(
@@ -89,14 +89,14 @@ class History(given.Sealed):
         self._records.add(self._record(before, taken.by_id(), taken.held if held is None else held))
 
     def note_start(self) -> None:
-        """Keep what a motion begins with, and its first acceleration."""
+        """Record the initial state of a motion, and its first acceleration."""
         dynamics = self.problem.dynamics
         assert dynamics is not None
         led = Taken().with_led(led_by(self.problem, dynamics.time))
         self._start = self._record(Memory.of(self.problem), led.by_id(), 1.0)
 
     def _record(self, before: Memory, shares: dict[int, float], held: Array | float) -> Record:
-        """The problem as it is, at the end of a step that began so."""
+        """Record of the present state, at the end of a step that began with ``before``."""
         problem, dynamics = self.problem, self.problem.dynamics
         return Record(
             before=before,
@@ -116,27 +116,24 @@ class History(given.Sealed):
     ) -> list[Array | fem.Function]:
         """Derivatives of a functional of the recorded steps by parameters of the problem, by one adjoint solve a step (collective).
 
-        Exact for the discrete steps: the derivatives are those of all that is computed, with the contactors that touched, stuck and
-        slipped, the points that yielded, and the length of each step. A change of a control is the same in all steps; of the values of
-        ``load``, and of Dirichlet values that load steps lead to, it is a change of those at the full load, or at time 1. The problem is
-        left as it is.
+        Exact for the discrete steps: the recorded active sets, sticking and slipping contactors, yielding points and step lengths are
+        kept. A change of a control is the same in all steps. A change of a value in ``load``, or of a Dirichlet value at the end of a
+        ramp, is its change at the full load, or at time 1. The problem is unchanged.
 
         Args:
-            J: functional of ``problem.u`` in the last step and of the controls, as of :func:`uem_dolfinx.gradient`; in time also of
+            J: functional of ``problem.u`` in the last step and of the controls, as in :func:`uem_dolfinx.gradient`; in time also of
                 ``velocity`` and ``acceleration`` of the dynamics; or a list of functionals, one for each step or None, whose sum is
                 differentiated.
-            controls: as of :func:`uem_dolfinx.gradient`, coefficients of friction among them; in time also the Constant that is the
-                density of the mass, and the Function that is the velocity at the start; of ``VonMises`` its parameters as they were
-                handed over.
+            controls: as in :func:`uem_dolfinx.gradient`, and coefficients of friction; in time also the Constant that is the density of
+                the mass, and the Function with the initial velocity; for ``VonMises`` the objects passed as its parameters.
 
         Returns:
-            As of :func:`uem_dolfinx.gradient`.
+            As in :func:`uem_dolfinx.gradient`.
 
         Raises:
             InputError, InputTypeError: see :func:`uem_dolfinx.gradient` and :func:`recording`; if no step was recorded; for controls and
-                fields in J of which steps know no derivatives; or where anchors have none: beside edges of the target in space, and in
-                its corners.
-            LinearSolveError: if a united matrix is singular.
+                fields in J without derivatives; for anchors without derivatives, next to edges of the target in 3D and in its corners.
+            LinearSolveError: if a constrained matrix is singular.
         """
         problem = self.problem
         some = check_controls(problem, "controls", [controls] if isinstance(controls, AnyControl) else controls)
@@ -169,7 +166,7 @@ class History(given.Sealed):
         return sweep.found
 
     def _refuse_moved_nodes(self) -> None:
-        """Refuse steps that were taken with nodes at other places than now (collective)."""
+        """Refuse steps that were taken with other positions of the nodes (collective)."""
         now = _places(self.problem)
         with agreed(self.problem.comm):
             for k, then in enumerate(self._places):
@@ -180,7 +177,7 @@ class History(given.Sealed):
                     )
 
     def _check_controls(self, controls: Sequence[AnyControl]) -> None:
-        """Refuse controls that steps depend on in a way of which there are no derivatives (collective)."""
+        """Refuse controls by which recorded steps have no derivatives (collective)."""
         problem, dynamics = self.problem, self.problem.dynamics
         load = problem.load if isinstance(problem.load, Mapping) else {}
         density = None if dynamics is None else dynamics.mass.density
@@ -214,7 +211,7 @@ class History(given.Sealed):
                     raise InputError(f"controls[{k}] is a part of the density: expected a Constant that is the density itself")
 
     def _functionals(self, J: Any) -> list[ufl.Form | None]:
-        """One for each step, or None (collective)."""
+        """A functional for each step, or None (collective)."""
         n, problem = len(self), self.problem
         with agreed(problem.comm):
             if not n:
@@ -241,13 +238,13 @@ class History(given.Sealed):
         return [None if f is None else whole[id(f)] for f in some]
 
     def _state(self) -> list[fem.Function]:
-        """What functionals are of."""
+        """Functions that functionals may depend on."""
         dynamics = self.problem.dynamics
         rates = [] if dynamics is None else [dynamics.velocity, dynamics.acceleration]
         return [self.problem.u, *rates, *(law.stress_in_forms for law in self._laws)]
 
     def _refuse_unknown(self, what: str, J: ufl.Form) -> None:
-        """Refuse a functional of fields that follow the displacement in a way of which there are no derivatives."""
+        """Refuse a functional of fields whose derivatives by the displacement are not available."""
         dynamics = self.problem.dynamics
         for f in J.coefficients():
             if dynamics is not None and (f is dynamics.mean_velocity or f is dynamics.forces):
@@ -259,7 +256,7 @@ class History(given.Sealed):
                 )
 
     def _put(self, values: Sequence[Array], friction: Sequence[Array | None], offsets: Sequence[Array | None]) -> None:
-        """Let the problem be made of these (collective)."""
+        """Set the values of Constants and Functions, friction and offsets of the problem (collective)."""
         for m, value in zip(self._inputs, values):
             forms.values_of(m)[...] = value
         for pair, mu, offset in zip(self.problem.pairs, friction, offsets):
@@ -270,7 +267,7 @@ class History(given.Sealed):
                 pair.discretisation.set_offset(offset)
 
     def _place(self, record: Record) -> None:
-        """Bring the problem to the end of a step, before it was committed (collective)."""
+        """Set the problem to the end of a recorded step, before its commit (collective)."""
         problem = self.problem
         self._put(record.values, record.friction, record.offsets)
         record.before.put_back(problem)
@@ -283,7 +280,7 @@ class History(given.Sealed):
 
 
 def _places(problem: UnitedProblem) -> bytes:
-    """What tells the places of this rank's nodes from others."""
+    """Digest of the positions of this rank's nodes."""
     return blake2b(np.ascontiguousarray(problem.config.mesh.geometry.x).tobytes()).digest()
 
 
@@ -293,7 +290,7 @@ def _friction_of(pair: Any) -> Array | None:
 
 @contextmanager
 def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> Iterator[History]:
-    """Keep all steps that a problem takes in a ``with`` block, for gradients through their history (collective).
+    """Record all steps of a problem in a ``with`` block, for gradients through their history (collective).
 
     Example::
 
@@ -302,19 +299,19 @@ def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> I
                 ...
         by_E, by_mu = history.gradient(J, [E, uem.ContactParameter(contact, "friction")])
 
-    Each step keeps the displacement, what contactors, laws and inertia remember, and the values of Constants and Functions in the residual
-    that have changed.
+    A record contains the displacement, the history of contactors, laws and inertia, and the changed values of Constants and Functions in
+    the residual.
 
     Args:
-        problem: in statics or in time; it may have Coulomb's friction between nodes of degree 1 and surfaces of sliding='finite', and laws
-            ``VonMises``.
-        scratch: folder for a file of each rank that holds the steps, which is gone with the history; None keeps them in memory.
+        problem: in statics or in time; supported are Coulomb friction between nodes of degree 1 and surfaces with sliding='finite', and
+            ``VonMises`` as law with history.
+        scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
 
     Yields: The history, which may be used in the block and after it.
 
     Raises:
-        InputError, InputTypeError: for a problem that there are no such derivatives of: with mortar and friction, other laws with history
-            or of friction, wear, ties, offsets of contacts with friction, or in time sliding='small'; or if there is no such folder.
+        InputError, InputTypeError: for a problem without such derivatives: with mortar and friction, other laws with history or of
+            friction, wear, ties, offsets of contacts with friction, or in time sliding='small'; or if the folder does not exist.
     """
     check_problem(problem)
     with agreed(problem.comm):
@@ -351,7 +348,7 @@ def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> I
 
 
 def _check_first(problem: UnitedProblem, what: str) -> None:
-    """Refuse a problem whose steps depend on some that were not recorded."""
+    """Refuse a problem whose steps depend on earlier steps that were not recorded."""
     if problem.progress.steps:
         raise InputError(
             f"the problem has taken {problem.progress.steps} step(s), on which {what} depend: expected a problem that is recorded from its "
@@ -360,7 +357,7 @@ def _check_first(problem: UnitedProblem, what: str) -> None:
 
 
 def _check_friction(problem: UnitedProblem, contact: Any) -> None:
-    """Refuse contacts with friction through whose memory there are no derivatives."""
+    """Refuse contacts with friction whose history has no derivatives."""
     pair, law = contact.pair, as_law(contact.friction)
     for wrong, expected in (
         (not pair.discretisation.pointwise or problem.config.degree > 1, "coupling='node_to_surface' and cells of degree 1"),
