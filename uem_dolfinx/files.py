@@ -1,4 +1,4 @@
-"""Files that ranks write together, or rank 0 for all: what goes wrong on one rank is the same named error on all."""
+"""Files written by all ranks together, or by rank 0 for all: an error on one rank is raised on all."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ PIECE = 2**30
 #: Longest path as given: Open MPI's MPI-IO overruns a buffer of 256 bytes, in which endings are appended to it.
 #: [format; bytes; -]
 LONGEST_PATH = 200
-#: What helps where a file cannot be written.
+#: Remedy if a file cannot be written.
 REMEDY = "check the folder, its rights and its free space"
 
 
 class Trouble:
-    """First thing that went wrong on this rank: what is collective goes on, and all ranks raise at its end.
+    """The first error on this rank: collective operations continue, and all ranks raise it at their end.
 
     Args:
         comm: communicator of the ranks that have to agree.
-        what: cannot be done, in words.
-        remedy: what helps.
-        kind: class of the error that files raise; others of the package stay what they are.
+        what: sentence about the failed operation.
+        remedy: remedy, in words.
+        kind: class of the errors raised for files; other errors of the package are kept.
     """
 
     def __init__(self, comm: MPI.Comm, what: str, remedy: str = REMEDY, kind: type[UEMError] = OutputError):
@@ -59,7 +59,7 @@ class Trouble:
 
     @property
     def none(self) -> bool:
-        """Whether nothing went wrong here yet."""
+        """Whether there is no error on this rank yet."""
         return self._error is None
 
     def agree(self) -> None:
@@ -68,7 +68,7 @@ class Trouble:
 
 
 def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
-    """A path, the same on all ranks; InputTypeError or InputError if it is none or too long (collective)."""
+    """A path, the same on all ranks; InputTypeError or InputError if it is no path or too long (collective)."""
     with agreed(comm):
         given.kind(what, value, isinstance(value, (str, os.PathLike)), "the path of a file", "None is none")
         if not Path(value).name:
@@ -83,19 +83,19 @@ def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
 
 
 def on_rank_0(comm: MPI.Comm, what: str, action: Callable[[], T]) -> T:
-    """Do something with files on rank 0, and tell all ranks what came of it (collective).
+    """Call a function that uses files on rank 0, and send its result or error to all ranks (collective).
 
     Args:
         comm: communicator.
-        what: cannot be done if the system refuses, in words.
+        what: sentence about the failed operation, for errors of the operating system.
         action: called on rank 0.
 
     Returns:
-        What the action returns.
+        The result of the action, on all ranks.
 
     Raises:
-        OutputError: if the system refuses.
-        BaseException: what else the action raises.
+        OutputError: for errors of the operating system.
+        BaseException: any other error of the action.
     """
     found: BaseException | None = None
     result: T | None = None
@@ -145,15 +145,15 @@ def flush(path: Path) -> None:
 
 
 class OwnFile:
-    """A file that one run alone writes from its opening to its closing; it stays this run's when another moves it aside.
+    """A file that only one run writes, from opening to closing, even if another run moves it to a folder of earlier results.
 
-    The lock that keeps others from going on with it ends with the process; where a file system has none, a file that another run has
-    written to is known by its size.
+    A lock excludes other runs and ends with the process. On file systems without locks, changes by another run are detected by the
+    file's size.
 
     Args:
-        path: name of the file, which must be there unless it is ``new``.
-        new: make it, where none may be.
-        locked: lock it; one rank does it for all.
+        path: name of the file, which must exist unless ``new``.
+        new: create the file, which must not exist.
+        locked: lock it; one rank does this for all.
 
     Raises:
         OutputError: if another run has not closed it.
@@ -163,7 +163,7 @@ class OwnFile:
     def __init__(self, path: Path, *, new: bool = False, locked: bool = True):
         self.path = path
         self._descriptor = os.open(path, os.O_RDWR | (os.O_CREAT | os.O_EXCL if new else 0), 0o666)
-        #: Closes the file, once; also if no other object refers to it.
+        #: Closes the file, once; also when the object is collected as garbage.
         self.close = weakref.finalize(self, os.close, self._descriptor)
         self._size = self.size
         if locked and not _lock(self._descriptor):
@@ -178,10 +178,10 @@ class OwnFile:
         return os.fstat(self._descriptor).st_size
 
     def check(self, sized: bool = True) -> None:
-        """Refuse to write to a file that is no longer there, or if ``sized`` has become longer or shorter by itself.
+        """Refuse to write to a file that was removed or, if ``sized``, whose size was changed by another program.
 
         Raises:
-            OutputError: if it is so.
+            OutputError: in either case.
         """
         gone, size = not os.fstat(self._descriptor).st_nlink, self.size
         if gone or (sized and size != self._size):
@@ -191,11 +191,11 @@ class OwnFile:
             )
 
     def read(self) -> bytes:
-        """All that is in it."""
+        """All bytes of the file."""
         return os.pread(self._descriptor, self.size, 0)
 
     def read_at(self, offset: int, array: AnyArray) -> None:
-        """Read a contiguous array from an offset in bytes, as far as there is one."""
+        """Read a contiguous array from an offset in bytes, up to the end of the file."""
         data, done = as_bytes(array).data, 0
         while done < len(data) and (n := os.preadv(self._descriptor, [data[done : done + PIECE]], offset + done)):
             done += n
@@ -205,14 +205,14 @@ class OwnFile:
         _write_all(self._descriptor, offset, as_bytes(np.ascontiguousarray(array)).data)
 
     def hand_over(self) -> None:
-        """Give what was written to the file system, so that others see it, as closing a file does where it is another machine's."""
+        """Flush written data to a network file system, as closing a file does, so that other machines see it."""
         os.close(os.dup(self._descriptor))
 
     def replace_end(self, offset: int, data: bytes) -> None:
-        """Put other bytes in place of all from an offset on; if the disk refuses, those that were there come back.
+        """Replace all bytes from an offset on; if writing fails, the previous bytes are restored.
 
         Raises:
-            OSError: if not all can be written.
+            OSError: if not all bytes can be written.
             OutputError: see ``check``.
         """
         self.check()
@@ -227,7 +227,7 @@ class OwnFile:
         self._size = offset + len(data)
 
     def truncate(self, size: int) -> None:
-        """Cut what is behind a size in bytes."""
+        """Cut the file to a size in bytes."""
         os.truncate(self._descriptor, size)
 
 
@@ -236,7 +236,7 @@ def _lock(descriptor: int) -> bool:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        # other errors are those of file systems without locks
+        # other errors come from file systems without locks
         return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
     return True
 
@@ -254,7 +254,7 @@ def in_use(path: Path) -> bool:
 
 
 def begin_file(path: Path) -> OwnFile:
-    """A new empty file of one's own, in place of an unused one."""
+    """A new empty file, which replaces an unused file."""
     path.unlink(missing_ok=True)
     return OwnFile(path, new=True)
 
@@ -266,7 +266,7 @@ def _write_all(descriptor: int, offset: int, data: memoryview) -> None:
 
 
 def aside(stem: Path, ending: str = "") -> Path:
-    """A name beside others that is not taken yet: the stem's with the next free number, and an ending."""
+    """An unused name in the same folder: the stem with the next free number, and an ending."""
     k = 1
     while (free := stem.with_name(f"{stem.name}.{k}{ending}")).exists():
         k += 1
@@ -274,23 +274,23 @@ def aside(stem: Path, ending: str = "") -> Path:
 
 
 def new_folder(stem: Path) -> Path:
-    """Make a folder beside others: the stem's name with the next free number."""
+    """Make a folder whose name is the stem with the next free number."""
     while True:
         folder = aside(stem)
         try:
             folder.mkdir()
         except FileExistsError:
-            # another run was faster
+            # another run has created it meanwhile
             continue
         return folder
 
 
 def keep_aside(stem: Path, names: Iterable[Path]) -> None:
-    """Move what there is of earlier results to a folder of their own, and say so; a run that still writes them goes on there.
+    """Move existing results to a new folder, with a warning; a run that still writes them continues there.
 
     Args:
-        stem: the folder's name but for its number.
-        names: files and folders to move, which keep their names, so that what refers to another one still finds it.
+        stem: the folder's name without its number.
+        names: files and folders to move; they keep their names, so that references between them stay valid.
 
     Raises:
         OSError: if they cannot be moved.

@@ -1,6 +1,6 @@
-"""The one logger of the package, its timers and its progress bar.
+"""The logger of the package, its timers and its progress bar.
 
-It logs on rank 0 only, silent until the application configures logging; timings are in DOLFINx's own table, under ``~UEM:``.
+It logs on rank 0 only, and is silent until the application configures logging. Timings are in DOLFINx's table, under ``~UEM:``.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ def _is_rank_zero(record: logging.LogRecord) -> bool:
 
 
 logger = logging.getLogger("uem_dolfinx")
-"""Rank 0's logger; handlers and levels are the application's business."""
+"""Rank 0's logger; the application sets handlers and levels."""
 logger.addFilter(_is_rank_zero)
 
 
 def say(line: str) -> None:
-    """Print a line that the user has asked for, on rank 0."""
+    """Print a line that the user has requested, on rank 0."""
     if MPI.COMM_WORLD.rank == 0:
         print(line, flush=True)
 
@@ -56,7 +56,7 @@ def timed(stage: str) -> Iterator[None]:
     """Time a stage of the method; ``dolfinx.common.list_timings`` shows it as ``~UEM: stage``.
 
     Args:
-        stage: what is done inside, e.g. ``"search"``.
+        stage: name of the stage, e.g. ``"search"``.
     """
     _stages[stage] = None
     with Timer(f"~UEM: {stage}"):
@@ -64,7 +64,7 @@ def timed(stage: str) -> Iterator[None]:
 
 
 class Timings(dict[str, tuple[int, float]]):
-    """How often each stage has been timed, and its wall time in seconds; printed as a table, the longest first."""
+    """Number of calls and wall time in seconds of each stage; printed as a table, the longest first."""
 
     def __str__(self) -> str:
         rows = sorted(self.items(), key=lambda item: -item[1][1])
@@ -72,7 +72,7 @@ class Timings(dict[str, tuple[int, float]]):
 
 
 def timings() -> Timings:
-    """How often each stage has been timed on this rank so far, and its wall time in seconds; some hold others.
+    """Number of calls and wall time in seconds of each stage on this rank so far; some stages contain others.
 
     ``print(uem.timings())`` shows a table.
     """
@@ -80,10 +80,10 @@ def timings() -> Timings:
 
 
 def timing(stage: str) -> tuple[int, float]:
-    """How often a stage has been timed on this rank so far, and its wall time in seconds; names as ``timings`` has them.
+    """Number of calls and wall time in seconds of a stage on this rank so far; names as in ``timings``.
 
     Raises:
-        InputError, InputTypeError: for a name of no stage.
+        InputError, InputTypeError: for an unknown stage.
     """
     known = "the name of a stage, as print(uem.timings()) shows them"
     given.kind("stage", stage, isinstance(stage, str), known)
@@ -94,10 +94,10 @@ def timing(stage: str) -> tuple[int, float]:
 
 @contextmanager
 def compiling(what: str) -> Iterator[None]:
-    """Time the compilation of forms, and tell the user if there is any: it takes a while, in the first run only.
+    """Time the compilation of forms, and log it if it happens: it takes a while, in the first run only.
 
     Args:
-        what: is compiled, e.g. ``"the residual"``.
+        what: compiled forms in words, e.g. ``"the residual"``.
     """
     ffcx = logging.getLogger("ffcx")
     told = False
@@ -108,7 +108,7 @@ def compiling(what: str) -> Iterator[None]:
             told = True
             logger.info("compiling %s: later runs find it in the cache", what)
 
-    # FFCx reports the stages of a compilation to its logger, whose level it sets itself; what it finds in its cache has none
+    # FFCx logs the stages of a compilation, at a level that it sets itself; forms found in its cache have no stages
     ffcx.info = info  # type: ignore[assignment]
     try:
         with timed("compile forms"):
@@ -118,12 +118,12 @@ def compiling(what: str) -> Iterator[None]:
 
 
 def progress(items: Iterable[T], description: str = "", total: int | None = None) -> Iterable[T]:
-    """Iterate with a progress bar where someone can see one.
+    """Iterate with a progress bar if standard error is a terminal.
 
     Args:
-        items: what to iterate over.
+        items: to iterate over.
         description: text in front of the bar.
-        total: number of items, where ``items`` does not know it.
+        total: number of items, if ``items`` has no length.
 
     Returns:
         ``items`` behind a tqdm bar on rank 0 when standard error is a terminal and tqdm is installed, else ``items``.

@@ -1,4 +1,4 @@
-"""What ranks send each other: rows of arrays, their answers, and one error for all."""
+"""Communication between ranks: exchange of rows of arrays with replies, reductions, and errors raised on all ranks."""
 
 from __future__ import annotations
 
@@ -34,16 +34,15 @@ POLLED = 1e-3
 def agree(comm: MPI.Comm, error: BaseException | None) -> None:
     """Raise on every rank the error of the first rank that has one (collective).
 
-    Ranks that each look at their own part of the mesh must not raise alone: the others would wait for ever
-    in the next collective call.
+    If a single rank raised an error, the others would wait for ever in the next collective call.
 
     Args:
         comm: the communicator whose ranks have to agree.
-        error: what this rank found wrong, or None.
+        error: error of this rank, or None.
 
     Raises:
-        BaseException: the same error on all ranks, if any rank had one, SystemExit and KeyboardInterrupt among them; a RuntimeError
-            with its words if it cannot be sent as it is.
+        BaseException: the same error on all ranks, if any rank has one, including SystemExit and KeyboardInterrupt; a RuntimeError
+            with its text if it cannot be pickled.
     """
     if comm.size > 1 and reduced(comm, error is not None, op=MPI.LOR):
         errors = comm.allgather(_sendable(error))
@@ -55,7 +54,7 @@ def agree(comm: MPI.Comm, error: BaseException | None) -> None:
 
 
 def mark_as_agreed(error: BaseException) -> BaseException:
-    """The error, of which is known that all ranks raise it."""
+    """The error, marked as raised on all ranks."""
     error.of_all_ranks = True  # type: ignore[attr-defined]
     return error
 
@@ -66,7 +65,7 @@ def is_agreed(error: BaseException | None) -> bool:
 
 
 def _end_all_ranks(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Tell of an error that ends the script; where it is Ctrl-C on one rank, end the others, which would wait for it for ever."""
+    """Print an error that ends the script; after Ctrl-C on one rank, abort the others, which would wait for ever."""
     _tell(kind, error, trace)
     if isinstance(error, KeyboardInterrupt) and not is_agreed(error) and not MPI.Is_finalized():
         sys.stderr.flush()
@@ -79,7 +78,7 @@ if MPI.COMM_WORLD.size > 1:
 
 
 def _sendable(error: BaseException | None) -> Any:
-    """The error, or one with its words if other ranks could not read it."""
+    """The error, or a RuntimeError with its text if it cannot be pickled."""
     try:
         return error if type(pickle.loads(pickle.dumps(error))) is type(error) else RuntimeError(str(error))
     except Exception:
@@ -88,7 +87,7 @@ def _sendable(error: BaseException | None) -> Any:
 
 @contextmanager
 def agreed(comm: MPI.Comm) -> Iterator[None]:
-    """What is raised in this block on one rank, at its end is raised on all; the block itself must not be collective (collective)."""
+    """Raise an error of this block on one rank at its end on all ranks; the block itself must not be collective (collective)."""
     error: BaseException | None = None
     try:
         yield
@@ -98,16 +97,16 @@ def agreed(comm: MPI.Comm) -> Iterator[None]:
 
 
 def ask(what: str, f: Callable[..., T], *args: Any) -> T:
-    """What a function of the user's returns.
+    """The return value of a function of the user.
 
     Args:
-        what: it is, for messages.
+        what: name of the function in messages.
         f: called with ``args``.
         args: of the function.
 
     Raises:
-        UserFunctionError: naming it, and what it raised where, GeneratorExit included, which would end the steps without a word; an
-            error of the package's own passes as it is, and so do SystemExit, KeyboardInterrupt and others that are no Exception.
+        UserFunctionError: with the function's name, its error and line; also for GeneratorExit, which would silently end the steps.
+            Errors of the package, SystemExit, KeyboardInterrupt and others that are no Exception are not changed.
     """
     try:
         return f(*args)
@@ -121,44 +120,44 @@ def ask(what: str, f: Callable[..., T], *args: Any) -> T:
 
 
 def ask_together(comm: MPI.Comm, what: str, f: Callable[..., T], *args: Any) -> T:
-    """``ask`` on every rank; what it raises on one is raised on all (collective)."""
+    """``ask`` on every rank; an error on one rank is raised on all (collective)."""
     with agreed(comm):
         return ask(what, f, *args)
     raise AssertionError("an error that no rank raised")
 
 
 class _Meeting:
-    """A communicator of its own for one on which its ranks wait for each other with an end, until some have not come in time."""
+    """A duplicate of a communicator for barriers with a time limit, until ranks have missed one."""
 
     def __init__(self, comm: MPI.Comm):
         self.comm, self.missed = comm.Dup(), False
 
 
 def _free(comm: MPI.Comm, key: int, meeting: _Meeting) -> None:
-    """End a meeting with the communicator that it is for."""
+    """Free the communicator of a meeting together with the original communicator."""
     meeting.comm.Free()
 
 
-#: Key under which a communicator has its meeting.
+#: Attribute key of a communicator's meeting.
 _MEETING = MPI.Comm.Create_keyval(delete_fn=_free)
 
 
 def prepare_meeting(comm: MPI.Comm) -> None:
-    """Make what ``all_come`` needs, once for each communicator (collective)."""
+    """Prepare ``all_come``, once for each communicator (collective)."""
     if comm.size > 1 and comm.Get_attr(_MEETING) is None:
         comm.Set_attr(_MEETING, _Meeting(comm))
 
 
 def all_come(comm: MPI.Comm, seconds: float) -> bool:
-    """Whether all ranks come here, the last one no later than so many seconds after this one; the answer is the same on all that come.
+    """Barrier with a time limit: whether all ranks arrive within so many seconds; the same result on all ranks that arrive.
 
-    It may be called by some ranks only, at any time after ``prepare_meeting``: messages of other calls are not disturbed. Ranks that
-    have missed each other once do not meet again.
+    It may be called by some ranks only, at any time after ``prepare_meeting``, without interfering with messages of other calls. After
+    one missed barrier the result is always False.
     """
     if comm.size == 1:
         return True
     meeting: _Meeting = comm.Get_attr(_MEETING)
-    # the second time for those that come when others have just given up
+    # a second barrier, for ranks that arrive just when others give up
     for _ in range(2):
         if meeting.missed:
             return False
@@ -172,14 +171,14 @@ def all_come(comm: MPI.Comm, seconds: float) -> bool:
 
 
 class Exchange:
-    """Rows of arrays sent to other ranks, and answers to them sent back (making one is collective).
+    """Rows of arrays sent to other ranks, and replies sent back (the constructor is collective).
 
-    Arrays may have any type but objects, and rows of any shape, both the same on all ranks. All arrays of a call travel in one
-    message of plain bytes for each pair of ranks; on one rank nothing travels and what is all sent in order is not copied either.
+    Arrays may have any type except objects, and rows of any shape, both the same on all ranks. All arrays of a call are sent in one
+    message of bytes for each pair of ranks. On one rank nothing is sent, and rows in order are not copied.
 
     Args:
         comm: communicator.
-        rows: for each rank the indices of this rank's rows that go there; a row may go to several ranks, or to none.
+        rows: for each rank the indices of this rank's rows that are sent to it; a row may go to several ranks, or to no rank.
 
     Attributes:
         rows: indices of the rows sent, rank by rank ``(n_sent,)``; a row occurs as often as it is sent.
@@ -200,7 +199,7 @@ class Exchange:
 
         Args:
             comm: communicator.
-            rank: where each row goes ``(n,)``, -1 for nowhere.
+            rank: receiving rank of each row ``(n,)``, -1 for no rank.
         """
         order = np.argsort(rank, kind="stable")
         ends = np.searchsorted(rank[order], np.arange(comm.size + 1))
@@ -208,7 +207,7 @@ class Exchange:
 
     @property
     def origins(self) -> Ints:
-        """Ranks that the rows received come from ``(n_received,)``."""
+        """Sending ranks of the received rows ``(n_received,)``."""
         return np.repeat(np.arange(self.comm.size), self._received)
 
     def send(self, *arrays: AnyArray) -> list[AnyArray]:
@@ -216,7 +215,7 @@ class Exchange:
         return self._exchange([a[self._picked] for a in arrays], self._sent, self._received)
 
     def back(self, *arrays: AnyArray) -> list[AnyArray]:
-        """Answers ``(n_sent, ...)`` to ``rows``, from ``arrays (n_received, ...)`` that answer what was received (collective)."""
+        """Replies ``(n_sent, ...)`` for ``rows``, from ``arrays (n_received, ...)`` with replies to the received rows (collective)."""
         return self._exchange(list(arrays), self._received, self._sent)
 
     def _exchange(self, arrays: list[AnyArray], sent: AnyArray, received: AnyArray) -> list[AnyArray]:
@@ -235,14 +234,14 @@ class Exchange:
 
 
 def count_keys(comm: MPI.Comm, keys: Ints) -> Ints:
-    """How often each row of ``keys (n, k)`` occurs over all ranks ``(n,)`` (collective)."""
+    """Number of occurrences of each row of ``keys (n, k)`` on all ranks ``(n,)`` (collective)."""
     return sums_by_keys(comm, keys, np.ones((len(keys), 1), np.int64))[:, 0]
 
 
 def sums_by_keys(comm: MPI.Comm, keys: Ints, values: AnyArray) -> AnyArray:
     """Sums of the rows of ``values (n, k)`` with equal ``keys (n, l)`` over all ranks, for every row ``(n, k)`` (collective).
 
-    Equal rows meet on one rank.
+    Equal rows are summed on one rank.
     """
     meeting = Exchange.to(comm, keys[:, 0] % comm.size)
     met, their = meeting.send(keys, values)
@@ -256,7 +255,7 @@ def sums_by_keys(comm: MPI.Comm, keys: Ints, values: AnyArray) -> AnyArray:
 
 
 def gathered(comm: MPI.Comm, value: Any) -> AnyArray:
-    """A number, or an array ``(...)`` of the same shape on all ranks, of every rank ``(n_ranks, ...)``, in one call (collective)."""
+    """Numbers, or arrays ``(...)`` of the same shape, of all ranks ``(n_ranks, ...)``, in one call (collective)."""
     own = np.ascontiguousarray(value)
     if comm.size == 1:
         return own.reshape(1, *np.shape(value))
@@ -266,7 +265,7 @@ def gathered(comm: MPI.Comm, value: Any) -> AnyArray:
 
 
 def reduced(comm: MPI.Comm, value: Any, op: MPI.Op = MPI.SUM) -> Any:
-    """Sum, or another reduction, of a number or an array ``(...)`` over all ranks, in one call and as what it came (collective)."""
+    """Sum, or another reduction, of a number or an array ``(...)`` over all ranks, of the same type (collective)."""
     if comm.size == 1:
         return value
     own = np.asarray(value)

@@ -1,13 +1,13 @@
-"""Uniting equations that conflict, turned into independent ones: pure algebra, for equations of any origin.
+"""Conflicting constraint equations, replaced by independent ones: pure algebra, for equations of any origin.
 
-Most equations eliminate the normal component of their own contactor, whatever the others do. A few cannot [UEM, 4.1]:
+Most equations eliminate the normal component of their own contactor, independently of others. A few cannot [UEM, 4.1]:
 
-- the contactor's normal is prescribed, so that a component of the target must go instead;
-- several equations of one node have dependent directions, as where two targets lie in one plane;
-- equations follow each other in a ring, and depend on each other, as where two surfaces are contactor and target of each other.
+- the contactor's normal displacement is prescribed, so that a component of the target is eliminated instead;
+- several equations of one node have dependent directions, e.g. if two targets lie in one plane;
+- equations follow each other in a ring, and depend on each other, e.g. if two surfaces are contactor and target of each other.
 
 These are solved for one component each by Gauss-Jordan elimination with pivoting, in the order of their largest coefficients.
-Rows that depend on others end as zeros and are left out: what they ask for holds already, or nothing could make it hold.
+Rows that depend on others become zero and are dropped: they are satisfied already, or cannot be satisfied.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ EXTRAPOLATED = 1e-9
 
 
 class Rank(IntEnum):
-    """Ranks of equations, of which the first are the last to be left out."""
+    """Ranks of equations; the equations of the highest rank are dropped first."""
 
-    #: Those that are never left out for others.
+    #: Equations that are never dropped in favour of others.
     FIRM = 0
-    #: Of contactors in front of a facet.
+    #: Equations of contactors in front of a facet.
     WITHIN = 1
-    #: Of contactors past an end of the target.
+    #: Equations of contactors past an end of the target.
     PAST_END = 2
 
 
@@ -44,9 +44,9 @@ class Rank(IntEnum):
 class Group:
     """Conflicting equations that share nodes, and the independent ones that replace them.
 
-    ``given (m,)`` tells which of the conflicting equations, ``redundant (m,)`` those left out; ``independent (k,)`` are of global
-    nodes, which may live on any rank; ``shares (m, k)`` give the forces of the conflicting equations from those of the independent.
-    ``nodes (n_nodes,)`` are all that these act on, ascending.
+    ``given (m,)`` are the numbers of the conflicting equations, ``redundant (m,)`` marks dropped ones. ``independent (k,)`` are of
+    global nodes, on any rank; ``shares (m, k)`` maps forces of the independent equations to forces of the conflicting ones.
+    ``nodes (n_nodes,)`` are all nodes that the equations act on, ascending.
     """
 
     given: Ints
@@ -56,16 +56,16 @@ class Group:
     nodes: Ints
 
     def rotated(self, rows: UnitingEquations) -> Group:
-        """The group of the conflicting equations in other directions, which eliminate the same components.
+        """The group of the conflicting equations in other directions, with the same eliminated components.
 
-        With the given rows ``A`` and the shares ``S`` the independent ones are ``S'A``, here as there; they are solved for what those
-        eliminate, so that forces of the given equations keep their ratios.
+        With the given rows ``A`` and the shares ``S`` the independent rows are again ``S'A``. They are solved for the same components,
+        so that forces of the given equations keep their ratios.
 
         Args:
             rows: all conflicting equations, in their order, of global nodes.
 
         Raises:
-            LinAlgError: if those components do not follow from the equations any more.
+            LinAlgError: if the equations no longer determine these components.
         """
         own, m, terms = self.independent, len(self.given), np.flatnonzero(np.isin(rows.row, self.given))
         nodes = np.union1d(self.nodes, rows.followed[terms])
@@ -83,21 +83,21 @@ class Group:
 
 
 class IndependentEquations:
-    """Independent equations in place of conflicting ones, and the forces of the given ones from theirs (collective).
+    """Independent equations in place of conflicting ones, and the forces of the given equations from theirs (collective).
 
-    Conflicting equations that share nodes are solved together on the rank that has most of them; all others stay where they are.
+    Conflicting equations that share nodes are solved together on the rank that has most of them; other equations are not moved.
 
     Args:
         space: the nodes whose components are restricted.
         equations: of this rank's contactors.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, block)``.
-        ring: equations that follow each other in rings and depend on each other ``(m,)``; None for none.
-        firm: equations that are never left out for others, and depend on no other firm ones ``(m,)``; None for none.
+        ring: mask of equations that follow each other in rings and depend on each other ``(m,)``, or None.
+        firm: mask of equations that are never dropped, and depend on no other firm ones ``(m,)``, or None.
 
     Attributes:
         equations: the independent ones.
-        redundant: which of the given equations were left out because they depend on others ``(m,)``, known after ``forces``.
-        undetermined: which of them no longer tell the components that they eliminate, being rotated ``(m,)``.
+        redundant: mask of given equations that were dropped because they depend on others ``(m,)``, known after ``forces``.
+        undetermined: mask of given equations that, after rotation, no longer determine their eliminated components ``(m,)``.
         found: whether any equations on any rank conflict.
     """
 
@@ -122,12 +122,12 @@ class IndependentEquations:
         self._scatter(equations)
 
     def rotated(self, equations: UnitingEquations) -> IndependentEquations:
-        """The same equations in other directions, which eliminate the same components (collective).
+        """The same equations in other directions, with the same eliminated components (collective).
 
-        Where these no longer follow from the equations, the equations stay as they were and are told of by ``undetermined``.
+        Equations that no longer determine these components are unchanged and marked in ``undetermined``.
 
         Args:
-            equations: of this rank's contactors, in the order of those that were resolved.
+            equations: of this rank's contactors, in the order of the original equations.
         """
         other, rows = copy(self), self._gather(equations)
         other.redundant, other._groups, singular = self.redundant.copy(), [], np.zeros(len(rows), dtype=bool)
@@ -143,7 +143,7 @@ class IndependentEquations:
         return other
 
     def _gather(self, equations: UnitingEquations) -> UnitingEquations:
-        """The conflicting ones of these equations from all ranks, of global nodes, on the rank that solves them (collective)."""
+        """Conflicting equations of all ranks, with global nodes, on the rank that solves them (collective)."""
         mine = equations.select(self._conflicting)
         mine = replace(mine, node=self._space.to_global(mine.node))
         together, self._gathered = send(self._space.comm, mine, self._rank)
@@ -151,11 +151,11 @@ class IndependentEquations:
 
     @property
     def _sent(self) -> Ints:
-        """The conflicting equations in the order in which they went to the ranks that solve them."""
+        """The conflicting equations in the order in which they were sent to the ranks that solve them."""
         return np.flatnonzero(self._conflicting)[self._gathered.rows]
 
     def _scatter(self, equations: UnitingEquations) -> None:
-        """Take the groups' independent equations in place of the conflicting ones, each on the rank that has its node (collective)."""
+        """Replace conflicting equations by the groups' independent ones, each on the rank that owns its node (collective)."""
         space = self._space
         independent = UnitingEquations.join([group.independent for group in self._groups], space.block)
         solved, self._scattered = send(space.comm, independent, space.owner_of(independent.node))
@@ -163,7 +163,7 @@ class IndependentEquations:
         self.equations = UnitingEquations.join([equations.select(~self._conflicting), solved], space.block)
 
     def of_given(self, of_independent: Bools) -> Bools:
-        """Marks of the equations that stayed as they were, in their places among the given ones ``(m,)``."""
+        """Mask of the given equations ``(m,)`` from a mask of the independent ones; conflicting equations are False."""
         if not self.found:
             return of_independent
         given = np.zeros(len(self._conflicting), dtype=bool)
@@ -171,7 +171,7 @@ class IndependentEquations:
         return given
 
     def forces(self, multipliers: Array) -> Array:
-        """Contact forces of the given equations from ``multipliers``, those of ``equations`` in their order (collective)."""
+        """Contact forces of the given equations from the ``multipliers`` of ``equations`` (collective)."""
         if not self.found:
             return multipliers
         n = int((~self._conflicting).sum())
@@ -216,7 +216,7 @@ def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools) -> li
 
 
 def _cannot_eliminate(equations: UnitingEquations, free: Bools) -> Bools:
-    """Active equations that cannot eliminate a component of their own node each ``(m,)``."""
+    """Mask of active equations that cannot each eliminate a component of their own node ``(m,)``."""
     unable = np.zeros(len(equations), dtype=bool)
     for nodes, rows in equations.by_node():
         unable[rows] = (least_left(equations.direction[rows] * free[nodes, None, :]) < MOSTLY_PRESCRIBED)[:, None]
@@ -224,7 +224,7 @@ def _cannot_eliminate(equations: UnitingEquations, free: Bools) -> Bools:
 
 
 def _with_neighbours(space: Nodes, equations: UnitingEquations, conflicting: Bools) -> Bools:
-    """Add the equations of all nodes that conflicting ones act on, until none is left (collective)."""
+    """Add the equations of all nodes that conflicting equations act on, until there are no more (collective)."""
     conflicting = conflicting.copy()
     here = np.zeros(space.n_owned, dtype=bool)
     while True:
@@ -238,7 +238,7 @@ def _with_neighbours(space: Nodes, equations: UnitingEquations, conflicting: Boo
 
 
 def _ranks_of_groups(space: Nodes, equations: UnitingEquations, conflicting: Bools) -> Ints:
-    """The rank that solves each of the conflicting equations, the same for all that share nodes (collective)."""
+    """The rank that solves each of the conflicting equations, the same for equations that share nodes (collective)."""
     mine, counts = np.flatnonzero(conflicting), gathered(space.comm, len(equations))
     number, total = mine + int(counts[: space.comm.rank].sum()), int(counts.sum())
     terms = np.flatnonzero(conflicting[equations.row])
@@ -252,12 +252,12 @@ def _ranks_of_groups(space: Nodes, equations: UnitingEquations, conflicting: Boo
 def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: Ints | None = None) -> Group:
     """Gauss-Jordan elimination of ``A du = h`` in the free components, one direction of one node after the other.
 
-    Rows are made equally long first. Whether one depends on those chosen is asked of what it has across all of them, which
-    pivots do not change; it is then left out, and the others go on.
+    Rows are normalised first. A row depends on the chosen rows if its part orthogonal to all of them, which does not depend on the
+    pivots, is negligible; it is then dropped.
 
     In ``A (m, n_nodes, block)`` and ``free (n_nodes, block)`` each of the global nodes ``node (n_nodes,)`` has its block of columns;
-    ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; those of lowest ``rank (m,)`` come first:
-    see ``Rank``.
+    ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; the lowest ``rank (m,)`` is eliminated
+    first, see ``Rank``.
     """
     m, flat = len(A), (len(A), free.size)
     movable = (A * free).reshape(flat)
@@ -271,7 +271,7 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
     if len(k):
         shares = _shares(movable, (A[k] * free).reshape(len(k), free.size))
     terms = A[k]
-    # what is left of the pivot's own block is across the eliminated direction, and followed like any other node
+    # the rest of the pivot's block is orthogonal to the eliminated direction, and followed like any other node
     terms[np.arange(len(k)), pivot] -= direction
     row, column = np.nonzero((np.abs(terms) > NEGLIGIBLE).any(axis=2))
     independent = UnitingEquations(node[pivot], direction, -h[k], np.ones(len(k), bool), row, node[column], -terms[row, column])
@@ -281,14 +281,14 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
 
 
 def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: Ints) -> tuple[Ints, Ints, Array]:
-    """Eliminate one direction after the other from the rows ``A du = h``, in place; zeros are passed over.
+    """Eliminate one direction after the other from the rows ``A du = h``, in place; zeros are skipped.
 
     Args:
         A: the rows ``(m, n_nodes, block)``.
         h: their right-hand sides ``(m,)``.
         across: their free components ``(m, n_nodes * block)``, of length one; overwritten.
         free: components that may be eliminated ``(n_nodes, block)``.
-        rest: rows that have any ``(m,)``.
+        rest: mask of rows with free components ``(m,)``.
         rank: of the rows ``(m,)``: see ``Rank``.
 
     Returns:
@@ -305,7 +305,7 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
         among = rest & (rank == rank[rest].min())
         i = int(np.argmax(np.where(among, largest, -1.0)))
         t, rest[i] = int(where[i]), False
-        # rows that are chosen, or left out, are asked no more
+        # chosen and dropped rows are not updated any more
         q, asked = across[i] / left[i], np.flatnonzero(rest)
         filled = np.flatnonzero(q)
         along = across[asked[:, None], filled] @ q[filled]
@@ -329,7 +329,7 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
     k, pivot, direction = np.array(rows, np.int64), np.array(nodes, np.int64), np.reshape(directions, (len(rows), A.shape[2]))
     if not rows:
         return k, pivot, direction
-    # each of them still follows what later ones eliminate
+    # each row still contains components eliminated by later rows
     later = np.einsum("ksg,sg->ks", A[k][:, pivot], direction)
     both = solve_triangular(later, np.column_stack([A[k].reshape(len(k), -1), h[k]]), unit_diagonal=True, check_finite=False)
     A[k], h[k] = both[:, :-1].reshape(-1, *A.shape[1:]), both[:, -1]
@@ -337,9 +337,9 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
 
 
 def _shares(given: Array, independent: Array) -> Array:
-    """Least combinations of the given rows ``(m, n)`` that are the independent ones ``(k, n)``: ``(m, k)``."""
+    """Combinations of the given rows ``(m, n)``, of least norm, that equal the independent rows ``(k, n)``: ``(m, k)``."""
     from scipy.linalg import lstsq
 
-    # a complete orthogonal factorisation finds them ten times as fast as singular values
+    # a complete orthogonal factorisation is ten times as fast as a singular value decomposition
     rounding = np.finfo(float).eps * max(given.shape)
     return np.asarray(lstsq(given.T, independent.T, cond=rounding, lapack_driver="gelsy", check_finite=False)[0])

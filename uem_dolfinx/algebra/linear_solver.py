@@ -1,4 +1,4 @@
-"""The linear solve of the united system: pattern of ``P'KP`` reused, near-null space carried to q, KSP and PC by size or options."""
+"""Linear solver of the constrained system: pattern of ``P'KP`` reused, near-null space mapped to q, KSP and PC by size or options."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ KEPT_CHANGES = 0.1
 #: A preconditioner is kept while it takes no more than this times as many iterations for each digit as at first.
 #: [convention; ratio of iterations; test_linear_solver.py::test_preconditioner_is_kept]
 KEPT_SLOWER = 2.0
-#: What takes the place of types for symmetric matrices.
+#: Replacements for types of KSP and PC that need symmetric matrices.
 UNSYMMETRIC = {"cg": "gmres", "minres": "gmres", "cholesky": "lu", "icc": "ilu"}
 
 
 class UnitedSolver:
     """KSP for ``P'KP dq = P'(r - K c)``.
 
-    PETSc's ``options`` are given without ``prefix``; none choose by size. Without ``ksp_rtol`` solves are as accurate as is of use.
+    PETSc's ``options`` are given without ``prefix``; defaults depend on the size. Without ``ksp_rtol`` the tolerance follows Newton.
     """
 
     def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
@@ -50,37 +50,37 @@ class UnitedSolver:
             check_options({} if options is None else options, prefix)
         given.alike(space.comm, "UnitedProblem", petsc_options=options, petsc_options_prefix=prefix)
         self._prefix = prefix
-        #: Options that are asked for first, those that take over for the rest of a step where they do not suit, and where they fail.
+        #: Options used first, options for the rest of a step if the first do not fit the matrix, and options used if they fail.
         self._first, self._instead, self._at_need = options_in_turn(options, prefix, size, space.gdim, space.mixed)
-        #: Options of the user's that PETSc has not asked for yet; None once the user was told.
+        #: Options of the user that PETSc has not used yet; None after the warning.
         self._unused: set[str] | None = set(options or ())
         self._fixed_accuracy = "ksp_rtol" in self._first or PETSc.Options(prefix).hasName("ksp_rtol")
         self._A: Any = None
         self.ksp: Any = None
         self._use(self._first)
-        #: Where ``P'KP``, ``Q'KP`` and, without equations, K without prescribed components are kept.
+        #: Storage of ``P'KP``, ``Q'KP`` and, without equations, of K without prescribed components.
         self._united, self._unsymmetric = (UnitedMatrix(space, not self.iterative) for _ in range(2))
         self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
-        #: The last factorisation, and the united matrix that it serves to solve with, if it does.
+        #: The last factorisation, and the constrained matrix that is solved with it, or None.
         self._kept = KeptFactor(space)
         self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
-        #: K without the contact, and whether the present united matrix is made of it.
+        #: K condensed onto the contact, and whether the present constrained matrix uses it.
         self.condensed, self._on_condensed = Condensed(space), False
-        #: Whether K is the same for every displacement, and K of the last united matrix with the state of its values.
+        #: Whether K is the same for every displacement, and K of the last constrained matrix with the state of its values.
         self.lasting = False
         self._of: tuple[PETSc.Mat, int] | None = None
-        #: What the last united matrix was made of.
+        #: Fingerprint of the matrices that the last constrained matrix was made of.
         self._made_of: Any = None
-        #: P and K of the present united matrix, if it is symmetric and factorised.
+        #: P and K of the present constrained matrix, if it is symmetric and factorised.
         self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
-        #: Iterations per digit that the preconditioner took at first and takes now.
+        #: Iterations per digit with a new preconditioner, and now.
         self._first_pace = self._pace = 0.0
         #: Whether Q is not P, and whether a step begins.
         self._petrov_galerkin = self._begins = False
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.space.comm)
-        #: The preconditioner that the options ask for, which the KSP may have inside another one.
+        #: The preconditioner of the options, which the KSP may use within a deflated one.
         self.pc = ksp.getPC()
         ksp.setOptionsPrefix(self._prefix)
         ksp.setErrorIfNotConverged(False)
@@ -95,20 +95,20 @@ class UnitedSolver:
         return ksp
 
     def _use(self, options: dict[str, Any]) -> None:
-        """Make a KSP with these options, which knows nothing yet (collective)."""
+        """Make a new KSP with these options (collective)."""
         self.options = options
         if self.ksp is not None:
             self.ksp.destroy()
-        #: Whether the preconditioner has yet to see the present matrix; equations that it was made with.
+        #: Whether the preconditioner has to be set up for the present matrix; equations that it was made with.
         self._new = True
         self._made_with: UnitingEquations | None = None
         self.ksp = self._create_ksp()
-        #: Whether the KSP is for symmetric matrices, and the types of KSP and PC that the options ask for.
+        #: Whether the KSP is for symmetric matrices, and the types of KSP and PC in the options.
         self._symmetric = True
         self._types = self.ksp.getType(), self.pc.getType()
 
     def forget(self) -> None:
-        """Drop the united matrix and everything that the preconditioner has learnt of it (collective)."""
+        """Drop the constrained matrix, factorisations and the set-up of the preconditioner (collective)."""
         self._A = self._crossed = self._served = self._factor_of = self._of = self._made_of = None
         self._kept.drop()
         self.condensed.drop()
@@ -116,7 +116,7 @@ class UnitedSolver:
         self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
 
     def begin_step(self) -> None:
-        """Let what the united matrix has places for, and how it is solved, depend on this step alone."""
+        """Let the sparsity of the constrained matrix, and the method of solution, depend on this step only."""
         self._begins, self._of = True, None
         self._kept.drop()
         for part in (self.condensed, self._united, self._unsymmetric):
@@ -124,7 +124,7 @@ class UnitedSolver:
 
     @contextmanager
     def _in_database(self, **instead: Any) -> Iterator[None]:
-        """Show PETSc the options, some with another value; levels of a multigrid read theirs only when they are set up."""
+        """Put the options into PETSc's database, some with other values; levels of a multigrid read theirs during set-up."""
         database, prefix, options = PETSc.Options(), self._prefix, self.options | instead
         for key, value in options.items():
             database[prefix + key] = value
@@ -149,17 +149,17 @@ class UnitedSolver:
     def set_operator(
         self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, roughly: bool = False
     ) -> None:
-        """Build ``Q'(K + G)P`` and give it to the KSP, unless that has it (collective).
+        """Build ``Q'(K + G)P`` and set it as operator of the KSP, unless it is already set (collective).
 
-        ``restriction`` is P, of the current uniting equations, ``test`` is Q: if None, or the same object, P, and the matrix is
-        symmetric if K is. ``K`` is the tangent matrix without boundary conditions, ``G`` second derivatives of gaps times forces.
-        The matrix is the same, ``roughly``, where all but coefficients in P, Q and G is.
+        ``restriction`` is P, of the current constraint equations; ``test`` is Q, by default P, and the matrix is then symmetric if K
+        is. ``K`` is the tangent matrix without boundary conditions, ``G`` the second derivatives of gaps times forces. With
+        ``roughly``, matrices that differ only in coefficients of P, Q and G count as the same.
         """
         test = test or restriction
         self.condensed.begin_at(None)
         before, self._made_of = self._made_of, made_of(restriction, test, K, G, roughly)
         same = before is not None and before == self._made_of
-        # a step that begins is solved as if it were the first
+        # the first solve of a step does not depend on earlier steps
         otherwise = self._on_condensed or self._served is not None or self.options is not self._first
         if same and not (self._begins and otherwise):
             self._begins, self._of = False, (K, K.stateGet())
@@ -169,7 +169,7 @@ class UnitedSolver:
             self._use(self._first)
         self._begins = False
         if self._petrov_galerkin and self._instead and self.iterative:
-            self._use(self._instead)  # it tells the sign of the determinant as well
+            self._use(self._instead)  # a factorisation, which also yields the sign of the determinant
         self._served = None
         self._on_condensed = self._condense(restriction, test, K, G, same)
         if self._on_condensed or self._served is not None:
@@ -183,12 +183,12 @@ class UnitedSolver:
             self._set_unsymmetric(restriction, test, K, G)
             return
         if not self._symmetric and self.pc.getType() == "gamg":
-            # its smoothers would keep bounds on eigenvalues that were found by GMRES
+            # its smoothers would keep eigenvalue bounds estimated by GMRES
             self._use(self.options)
         self._set_symmetric(restriction, K, G)
 
     def _set_symmetric(self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
-        """Give ``P'(K + G)P`` to the KSP (collective)."""
+        """Set ``P'(K + G)P`` as operator of the KSP (collective)."""
         if restriction.alone and G is None:
             with timed("cross out prescribed components"):
                 if self._crossed is None or self._crossed[0] != K:
@@ -219,17 +219,17 @@ class UnitedSolver:
 
     @property
     def A(self) -> Any:
-        """The united matrix, of the whole (collective)."""
+        """The constrained matrix of all unknowns (collective)."""
         if not self._on_condensed:
             return self._A
         P, Q, K, G = self.condensed.made_of
         return (self._united if P is Q else self._unsymmetric).update(P, Q, K, G)
 
     def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, same: bool) -> bool:
-        """Unite on the components of the contact; whether that is done (collective).
+        """Constrain the condensed problem if this is cheaper; whether it is done (collective).
 
-        A solve on the contact takes two of the bodies, a factorisation some ten: that pays where K lasts, where Q is not P, since
-        no factorisation is kept then, or from the second matrix of a K on. Where a factorisation that is kept serves it is noted.
+        A condensed solve costs two solves of the bodies, a factorisation about ten. So condensation pays if K is constant, if Q is not
+        P (no factorisation is kept then), or from the second matrix of a K on. A kept factorisation that can be used is noted.
         """
         again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
         pays = not (self.iterative or self.space.mixed) and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
@@ -245,7 +245,7 @@ class UnitedSolver:
         return True
 
     def _factorise_inside(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, **options: Any) -> bool:
-        """Factorise K without the components of the contact; whether that can be done, and pays (collective)."""
+        """Factorise K without the components of the contact; whether this is possible and cheaper (collective)."""
         pc, symmetric = PETSc.PC().create(self.space.comm), is_symmetric(K, self.space)
         pc.setOptionsPrefix(self._prefix)
         pc.setType((self.pc.getType() if self._symmetric else self._types[1]) if symmetric else "lu")
@@ -259,11 +259,11 @@ class UnitedSolver:
 
     @property
     def _deflates(self) -> bool:
-        """Whether contactors much stiffer than what they press on are more than the preconditioner can do with."""
+        """Whether the preconditioner needs deflation of targets under much stiffer contactors."""
         return self.pc.getType() in MULTIGRID and not self.space.mixed
 
     def _adapt(self, symmetric: bool) -> None:
-        """Take the KSP and PC of the options, or ones for unsymmetric matrices in place of those for symmetric ones."""
+        """Use the KSP and PC of the options, or their replacements for unsymmetric matrices."""
         if symmetric == self._symmetric:
             return
         self._symmetric = symmetric
@@ -272,10 +272,10 @@ class UnitedSolver:
         ksp_type, pc_type = self._types if symmetric else (UNSYMMETRIC.get(kind, kind) for kind in self._types)
         self.ksp.setType(ksp_type)
         if ksp_type != self._types[0] or symmetric:
-            # what GMRES leaves is measured as a force, not through a preconditioner: P'KP is nearly singular where all slip
+            # GMRES measures true residuals, without preconditioner: P'KP is nearly singular if all contactors slip
             self.ksp.setPCSide(PETSc.PC.Side.LEFT if symmetric else PETSc.PC.Side.RIGHT)
         pc.setType(pc_type)
-        # the others have options of their own; one that stays is not shown its options again: hypre would lose what it has set up
+        # a new PC reads its own options; an unchanged PC must not read them again, because hypre would lose its set-up
         reader = pc
         if pc.getType() == before:
             reader = PETSc.PC().create(self.space.comm)
@@ -287,7 +287,7 @@ class UnitedSolver:
         self.ksp.setPC(pc)
 
     def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
-        """Give ``Q'(K + curvature)P`` to the KSP (collective)."""
+        """Set ``Q'(K + curvature)P`` as operator of the KSP (collective)."""
         A = self._unsymmetric.update(P, Q, K, curvature)
         if not self.iterative:
             self._new, self._A = True, A
@@ -295,7 +295,7 @@ class UnitedSolver:
         self.ksp.setOperators(A, self._A)
 
     def _changes(self, equations: UnitingEquations) -> tuple[int, int]:
-        """How many of the owned equations hold that did not, or the other way, since the preconditioner was made, and how many held."""
+        """Number of owned equations activated or released since the preconditioner was made, and number active at that time."""
         if not self.iterative or (before := self._made_with) is None:
             return 0, 0
         same = np.array_equal(equations.node, before.node)
@@ -303,7 +303,7 @@ class UnitedSolver:
         return int(changed), int(before.active.sum())
 
     def _keep_preconditioner(self, equations: UnitingEquations, changed: int, present: int) -> None:
-        """Decide whether the preconditioner serves the present matrix as well, after ``_changes`` on all ranks."""
+        """Decide whether to reuse the preconditioner for the present matrix, from ``_changes`` summed over all ranks."""
         known = self.iterative and self._made_with is not None
         keep = known and changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
         if not keep:
@@ -313,23 +313,23 @@ class UnitedSolver:
 
     @property
     def tells_sign(self) -> bool:
-        """Whether the solver tells the sign of the determinant of ``Q'KP`` where Q is not P."""
+        """Whether the solver yields the sign of the determinant of ``Q'KP``, for Q different from P."""
         return self._petrov_galerkin and mumps.solves(self.pc)
 
     @property
     def negative(self) -> bool:
-        """Whether ``Q'KP`` of the last solve has a negative determinant, as far as the solver tells it."""
+        """Whether ``Q'KP`` of the last solve has a negative determinant; False if its sign is unknown."""
         if self._on_condensed:
             return self._petrov_galerkin and self.condensed.negative
         return self.tells_sign and not self._new and mumps.is_negative(self.pc)
 
     @property
     def indefinite(self) -> bool:
-        """Whether the symmetric matrix factorised last has negative eigenvalues, beside multipliers', if MUMPS tells (collective)."""
+        """Whether the last factorised symmetric matrix has negative eigenvalues not due to multipliers, if known (collective)."""
         return self.condensed.indefinite if self._on_condensed else (not self._new and mumps.is_indefinite(self.pc, self.space))
 
     def negative_without(self, restriction: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> bool:
-        """Whether ``P'KP`` has a negative determinant, arguments as those of ``set_operator`` (collective)."""
+        """Whether ``P'KP`` has a negative determinant; arguments as in ``set_operator`` (collective)."""
         self._kept.drop()
         self.set_operator(restriction, K, curvature)
         if self._on_condensed:
@@ -338,7 +338,7 @@ class UnitedSolver:
         return mumps.is_negative(self.pc)
 
     def _set_up(self, **options: Any) -> None:
-        """Let the preconditioner see the present matrix, with these options beside its own (collective)."""
+        """Set up the preconditioner for the present matrix, with further options (collective)."""
         with self._in_database(**options):
             self.ksp.setUp()
             self.ksp.setUpOnBlocks()
@@ -352,19 +352,19 @@ class UnitedSolver:
 
     @property
     def inexact(self) -> bool:
-        """Whether solves are as accurate as asked, and no more."""
+        """Whether solves use the requested accuracy as tolerance."""
         return self.iterative and not self._fixed_accuracy
 
     @property
     def exact(self) -> bool:
-        """Whether solves with the present matrix leave no more than rounding."""
+        """Whether solves with the present matrix are exact up to rounding."""
         return not self.iterative and self._served is None
 
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and the number of linear iterations (collective).
 
-        An iterative solver whose options do not fix its ``ksp_rtol`` may leave the part ``accuracy`` of the right-hand side; it begins
-        with the unknowns ``near``, if they are given, of the last solve under the same forces of the bodies.
+        An iterative solver whose options do not fix ``ksp_rtol`` uses the relative tolerance ``accuracy``. Its initial guess is ``near``,
+        if given: the unknowns of the last solve under the same forces of the bodies.
 
         Raises:
             LinearSolveError: with PETSc's reason.
@@ -383,7 +383,7 @@ class UnitedSolver:
             self._of = self._made_of = None
             self.set_operator(*self._served)
             return self.solve(rhs, accuracy, near)
-        # a factorisation has no use for a guess
+        # factorisations need no initial guess
         guess = near if self.iterative else None
         dq = rhs.duplicate() if guess is None else guess.copy()
         self.ksp.setInitialGuessNonzero(guess is not None)
@@ -426,25 +426,25 @@ class UnitedSolver:
         return dq, iterations
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec) -> PETSc.Vec:
-        """``K du`` of an increment that the last solve has found; where that left some out, they are in equilibrium (collective)."""
+        """``K du`` of an increment of the last solve; components that were not completed are in equilibrium (collective)."""
         return forms.product(K, du) if self.iterative else self.condensed.forces(K, du, self.exact)
 
     def begin_at(self, c: PETSc.Vec, rounding: float = 0.0) -> None:
-        """Take what the increment is without the unknowns that are solved for next, to be completed, and what norm of forces is none."""
+        """Set the increment to which the next solves add ``P dq``, to be completed, and the norm below which forces are rounding."""
         self.condensed.begin_at(c, rounding)
 
     def complete(self, dq: PETSc.Vec, asked: Any = None) -> PETSc.Vec:
-        """The unknowns of the last solve, all of them, or only where it lacks one of the nodes ``asked`` for (collective)."""
+        """All unknowns of the last solve; with nodes ``asked``, completed only if one of these is missing (collective)."""
         return self.condensed.complete(dq, asked) if self._on_condensed else dq
 
     def _keep_pace(self, iterations: int) -> None:
-        """Note how many iterations a digit has taken."""
+        """Record the number of iterations per digit."""
         norms = self.ksp.getConvergenceHistory()
         if iterations > 0 and len(norms) > iterations and norms[iterations] > 0:
             self._pace = iterations / max(np.log10(norms[0] / norms[iterations]), np.finfo(float).eps)
             self._first_pace = self._first_pace or self._pace
 
     def _tell_unused(self) -> None:
-        """Warn, once, of options that PETSc has had no use for."""
+        """Warn, once, of options that PETSc has not used."""
         tell_unused(self._unused or (), self.options, f"{self.ksp.getType()} and {self.pc.getType()}")
         self._unused = None

@@ -1,17 +1,17 @@
-"""The restriction matrix P of uniting equations of any origin, and the united system ``P'KP`` [UEM, 6].
+"""The restriction matrix P of constraint equations of any origin, and the constrained system ``P'KP`` [UEM, 6].
 
 With the free unknowns q,
 
     du = P dq + c                        P: n x n with idle columns, m = n - (number of equations) of them in use
     P'KP dq = P'(r - K c)                [UEM, 6.6]
 
-Every equation eliminates one component of a node in a frame rotated to its direction [UEM, 4.1]:
+Every equation eliminates one component of a node, in a frame rotated to its direction [UEM, 4.1]:
 
     du = T dq + M du + d    so    P = (1 + M + M^2 + ...) T,    c = (1 + M + M^2 + ...) d
 
-T rotates each node's free components, M lets an eliminated component follow other nodes, d closes gaps and carries prescribed
-increments. The powers of M end after as many terms as bodies are stacked upon each other. Where equations follow each other in rings,
-by a small part each, they fade, and end where they are rounding; other rings are closed first.
+T rotates each node's free components, M makes eliminated components follow other nodes, and d contains gaps and prescribed increments.
+The number of powers of M is the number of bodies stacked upon each other. If equations follow each other in rings with small
+coefficients, the powers decay and the series is cut at rounding; other rings are closed first.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ MOST_ROUND = 32
 
 
 class Restriction:
-    """P and c of one set of uniting equations.
+    """P and c of one set of constraint equations.
 
     Args:
-        space: the nodes whose components are restricted, as many each as they have.
-        equations: uniting equations of the nodes this rank owns.
+        space: the nodes whose components are restricted.
+        equations: constraint equations of the nodes that this rank owns.
         free: components without Dirichlet condition, of the owned nodes ``(n_owned, block)``.
-        prescribed: increments that the Dirichlet conditions ask for ``(n_owned, block)``, zero where free.
+        prescribed: increments prescribed by the Dirichlet conditions ``(n_owned, block)``, zero where free.
         stacked: whether a node that is followed may itself be eliminated.
-        like: restriction of the same equations in other directions, whose components are eliminated and whose unknowns kept.
+        like: restriction of the same equations in other directions, with the same eliminated components and the same unknowns.
 
     Raises:
         ConflictError: if the equations leave a node no free component to eliminate.
@@ -67,7 +67,7 @@ class Restriction:
         g, n = space.block, space.n_owned
         self._sizes = ((g * n, g * space.n_global),) * 2
         self._first = g * space.first
-        #: Eliminated nodes, and with those that only hold their place in the sparsity of P.
+        #: Eliminated nodes, and all nodes of equations, including inactive ones in the sparsity of P.
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift, error = self._eliminate() if like is None else self._eliminate_like(like)
@@ -80,7 +80,7 @@ class Restriction:
         self.used[self.nodes] = (self.frames != 0).any(axis=1)
         self.rings: Rings | None = None
         self._hold(equations, prescribed)
-        #: The number of terms with M in the series of P and c, and whether equations follow each other in rings that fade.
+        #: The number of powers of M in the series of P and c, and whether equations follow each other in rings that decay.
         self.chain, self.fades = 1 if self.n_equations else 0, False
         if self.n_equations and stacked:
             self.chain, parts = self._longest_chain()
@@ -93,10 +93,10 @@ class Restriction:
                     self.chain, _ = self._longest_chain()
 
     def _hold(self, equations: UnitingEquations, prescribed: Array) -> None:
-        """Take the equations, which eliminate what they are known to, and what closes their gaps (collective)."""
+        """Set the equations, with known eliminated components, and the increments d that close their gaps (collective)."""
         self.equations = equations
         self.d = self._closing(prescribed, equations.gap)
-        #: Terms of the equations that hold, which are those of M, and the nodes that they follow.
+        #: Active equations, whose terms form M, and the nodes that they follow.
         self._held = equations.select(equations.active)
         self._follows, self._term = np.unique(self._held.followed, return_inverse=True)
         self._halo = Halo(self.space, self._follows) if self._n_rows else None
@@ -109,7 +109,7 @@ class Restriction:
     # -- elimination in each node's frame ------------------------------------------------------------------------------
 
     def _eliminate(self) -> tuple[Array, Array, ConflictError | None]:
-        """Blocks of T at ``nodes (k, g, g)``, how each equation acts on its node ``(m, g)``, and what forbids it."""
+        """Blocks of T at ``nodes (k, g, g)``, the action L of each equation on its node ``(m, g)``, and an error or None."""
         g, eq = self.space.block, self.equations
         frames = self.free[self.nodes, None, :] * np.eye(g)
         lift = np.zeros_like(eq.direction)
@@ -126,10 +126,10 @@ class Restriction:
         return frames, lift, error
 
     def _eliminate_like(self, like: Restriction) -> tuple[Array, Array, None]:
-        """What ``_eliminate`` returns, from the frames and the lift of other equations ``like``.
+        """As ``_eliminate``, from the frames T and the lift L of the restriction ``like``.
 
-        With ``A`` the directions here, and ``T`` and ``L`` the frame and the lift there, these are ``L (A L)^-1`` and
-        ``(1 - L (A L)^-1 A) T``: a frame, no longer orthonormal, with the same unknowns.
+        With the directions ``A`` of these equations, the lift is ``L (A L)^-1`` and the frame ``(1 - L (A L)^-1 A) T``: no longer
+        orthonormal, with the same unknowns.
         """
         eq, frames, lift = self.equations, like.frames.copy(), np.zeros_like(like.lift)
         for at, rows in eq.by_node():
@@ -150,22 +150,22 @@ class Restriction:
         )
 
     def _matrix(self, rows: Ints, columns: Ints, values: Array, sizes: Any = None) -> PETSc.Mat:
-        """Matrix from sorted local rows, global columns and values; of the displacement's size unless others are given."""
+        """Matrix from sorted local rows, global columns and values, by default of the displacement's size."""
         bsize = self.space.block if sizes is None else None
         sizes = sizes or self._sizes
         indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=sizes[0][0]))]).astype(PETSc.IntType)
         return PETSc.Mat().createAIJ(sizes, bsize=bsize, csr=(indptr, columns.astype(PETSc.IntType), values), comm=self.comm)
 
     def _longest_chain(self) -> tuple[int, PETSc.Mat | None]:
-        """How many equations follow one another from node to node, and by what parts if that has no end (collective).
+        """Length of the longest chain of equations, and, if chains are endless, the matrix of their coefficients (collective).
 
-        An equation follows another if its terms have a part in what the other eliminates of a node; what that leaves free ends a chain.
+        An equation follows another if its terms contain the component that the other eliminates; free components end a chain.
         """
         g, eq = self.space.block, self.equations
         m, k = len(eq), np.arange(g)
         counts = gathered(self.comm, m)
         first, sizes = int(counts[: self.comm.rank].sum()), (m, int(counts.sum()))
-        # terms at nodes of which nothing is eliminated lead nowhere
+        # terms at nodes without eliminated components end a chain
         eliminated = np.zeros((self.space.n_owned, 1))
         eliminated[eq.node[(self.lift != 0).any(axis=1)]] = 1.0
         on = self.space.ask_owners(eq.followed, eliminated)[:, 0] > 0
@@ -184,7 +184,7 @@ class Restriction:
         at = follows.createVecRight()
         at.set(1.0)
         length, left, before = 0, at.sum(), np.inf
-        # equations from which a path of so many leads; if none of them drops out, it has no end
+        # equations at the start of chains of this length; if their number does not decrease, chains are endless
         while 0.0 < left < before:
             at, length, before = follows * at, length + 1, left
             at.array[:] = at.array_r > 0
@@ -194,13 +194,13 @@ class Restriction:
     # -- P as a matrix -------------------------------------------------------------------------------------------------
 
     def rows(self) -> Blocks:
-        """Rows of P at the owned eliminated nodes; all others are those of the identity in free components (collective)."""
+        """Rows of P at the owned eliminated nodes; other rows are rows of the identity in free components (collective)."""
         T = self._turned(self.united)
         if self.chain == 0:
             return T
         assert self._halo is not None
         M, asked = self._couplings(self.equations.active), self._follows
-        # T has blocks on its diagonal alone
+        # T is block-diagonal
         turned = self._halo.take(lambda i: self._turned(i).value)
         terms, power = [T], Blocks(M.row, M.column, M.value @ turned[self._term])
         while True:
@@ -212,16 +212,16 @@ class Restriction:
             power = product(M, rows_at(self.space, power, asked))
 
     def rows_of(self, nodes: npt.NDArray[np.integer]) -> Blocks:
-        """Rows of P at owned nodes ``(k,)``, which have all eliminated ones (collective)."""
+        """Rows of P at owned nodes ``(k,)``, which must include all eliminated nodes (collective)."""
         return together(self._turned(np.setdiff1d(nodes, self.united)), self.rows())
 
     def reserved(self) -> Blocks:
-        """Places of ``rows``, and those that all equations would take if they held and followed no others."""
+        """Sparsity of ``rows`` if all equations were active, without chains."""
         return together(self._turned(self.nodes), self._couplings(np.ones_like(self.equations.active)))
 
     @property
     def followed_here(self) -> Ints:
-        """Local numbers of the owned nodes that equations of any rank follow that hold, repeated or not."""
+        """Local numbers of the owned nodes that active equations of any rank follow, possibly repeated."""
         return np.zeros(0, np.int64) if self._halo is None else self._halo.asked
 
     def followed(self, which: Bools) -> Ints:
@@ -251,7 +251,7 @@ class Restriction:
         return self._matrix(*self._entries(self.rows_of(np.arange(self.space.n_owned))))
 
     def _entries(self, blocks: Blocks) -> tuple[Ints, Ints, Array]:
-        """Sorted local rows, global columns and values of blocks in owned rows, zeros stored; equal places added."""
+        """Sorted local rows, global columns and values of blocks in owned rows; zeros are stored, duplicates added."""
         g, value = self.space.block, blocks.value
         k = np.arange(g)
         rows = np.broadcast_to((blocks.row[:, None] * g + k - self._first)[:, :, None], value.shape)
@@ -259,7 +259,7 @@ class Restriction:
         return _sum_duplicates(rows.ravel(), columns.ravel(), value.ravel())
 
     def cross_out(self, A: PETSc.Mat) -> None:
-        """Turn A into ``P'AP`` where there are no equations: P then only crosses out the prescribed components."""
+        """Replace A by ``P'AP`` if there are no equations: P then only crosses out the prescribed components."""
         used = self.space.vector(self.used.astype(float))
         A.diagonalScale(used, used)
 
@@ -267,15 +267,15 @@ class Restriction:
 
     @cached_property
     def c(self) -> PETSc.Vec:
-        """Increment that closes the gaps and carries the prescribed displacements; not to be changed (first time: collective)."""
+        """Increment that closes the gaps and contains the prescribed increments; read-only (first time: collective)."""
         return self._series(self.d)
 
     def carried(self, prescribed: Array) -> PETSc.Vec:
-        """What prescribed increments ``(n_owned, block)`` alone make of c: ``S (1 - L A) p`` with the series S of P (collective)."""
+        """Part of c due to prescribed increments p ``(n_owned, block)``: ``S (1 - L A) p`` with the series S of P (collective)."""
         return self._series(self._closing(prescribed, np.zeros(len(self.equations))))
 
     def _closing(self, prescribed: Array, gap: Array) -> PETSc.Vec:
-        """``p - L (gap + A p)``: what each node does by itself to close gaps ``(m,)`` under prescribed increments p."""
+        """``p - L (gap + A p)``: increments of each node alone that close gaps ``(m,)`` under prescribed increments p."""
         eq, closure = self.equations, np.array(prescribed)
         known = np.einsum("mg,mg->m", eq.direction, prescribed[eq.node])
         np.add.at(closure, eq.node, -self.lift * (gap + known)[:, None])
@@ -296,7 +296,7 @@ class Restriction:
         return self._series(self.space.vector(du))
 
     def pass_on(self, F: PETSc.Vec) -> PETSc.Vec:
-        """Hand the contactors' forces on to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F`` (collective)."""
+        """Transfer the contactors' forces to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F`` (collective)."""
         part = F.array_r.reshape(-1, self.space.block)
         total, eq = part.copy(), self._held
         for _ in range(self.chain):
@@ -322,7 +322,7 @@ class Restriction:
         return self.reduce(self.pass_on(F))
 
     def multipliers(self, y: PETSc.Vec) -> Array:
-        """Contact force of each equation along its direction ``(m,)``, positive where the contactor is pushed (collective with rings)."""
+        """Contact force of each equation along its direction ``(m,)``, positive in compression (collective with rings)."""
         nodal = y.array_r.reshape(-1, self.space.block)
         along = np.einsum("mg,mg->m", self.lift, nodal[self.equations.node])
         return along if self.rings is None else self.rings.forces(along)
@@ -346,20 +346,20 @@ class Restriction:
         return self.space.vector(total)
 
     def fingerprint(self, *, values: bool) -> int:
-        """Hash of this rank's part of P: of its sparsity and of which equations hold, or of its values too, but for rounding."""
+        """Hash of this rank's part of P: of its sparsity and active equations, optionally of its values up to rounding."""
         eq = self.equations
         parts = [*(v.tobytes() for v in (eq.node, eq.row, eq.followed, eq.active)), str(self.chain).encode()]
         if values:
-            # feet that have moved by rounding make no new P
+            # closest points that have moved by rounding do not change P
             parts += [np.rint(v / NEGLIGIBLE).astype(np.int64).tobytes() for v in (eq.direction, eq.coefficients)]
         return zlib.crc32(b"".join(parts))
 
 
 def _fading(parts: PETSc.Mat) -> int:
-    """After how many equations what goes round in rings is rounding of a unit displacement; 0 for too many (collective).
+    """Number of powers after which the series in rings has decayed to rounding; 0 if it decays too slowly (collective).
 
     Args:
-        parts: by which equations follow each other, positive ``(m, m)``.
+        parts: magnitudes of the coefficients with which equations follow each other ``(m, m)``.
     """
     at = parts.createVecRight()
     at.set(1.0)
@@ -371,10 +371,10 @@ def _fading(parts: PETSc.Mat) -> int:
 
 
 def _frames(A: Array, pinv: Array, free: Bools) -> Array:
-    """Blocks of T: an orthonormal frame of what the equations leave free; eliminated and prescribed columns are zero.
+    """Blocks of T: an orthonormal frame of the directions that equations leave free; eliminated and prescribed columns are zero.
 
-    A single direction is reflected onto the nearest axis (Householder), so that the frame stays close to the axes and the
-    two tangential unknowns keep the places of the components they resemble.
+    A single direction is reflected onto the nearest axis (Householder), so that the frame is close to the axes and the
+    two tangential unknowns take the columns of the nearest components.
 
     ``A (k, r, g)`` are directions in the free components ``free (k, g)``, and ``pinv (k, g, r)`` their pseudo-inverses.
     """
@@ -385,7 +385,7 @@ def _frames(A: Array, pinv: Array, free: Bools) -> Array:
         H, main = _reflection(A[some, 0] / np.linalg.norm(A[some, 0], axis=1, keepdims=True))
         blocks[some] = H * (free[some] & (np.arange(g) != main[:, None]))[:, None, :]
         return blocks
-    # directions left one after the other, each in the place that it is nearest to, from the projector onto the null space
+    # free directions one after the other, each in the nearest column, from the projector onto the null space
     null = free[:, None, :] * np.eye(g) - pinv @ A
     for n in range(left.max(initial=0)):
         more = np.flatnonzero(left > n)
@@ -398,7 +398,7 @@ def _frames(A: Array, pinv: Array, free: Bools) -> Array:
 
 
 def _reflection(axis: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Householder matrices that map the nearest coordinate axis onto ``axis (k, g)`` up to sign, and which it is."""
+    """Householder matrices that map the nearest coordinate axis onto ``axis (k, g)`` up to sign, and the axis' number."""
     main = np.argmax(np.abs(axis), axis=1)
     rows = np.arange(len(axis))
     v = axis.copy()
@@ -408,7 +408,7 @@ def _reflection(axis: Array) -> tuple[Array, npt.NDArray[np.int64]]:
 
 
 def _sum_duplicates(rows: Ints, columns: Ints, values: Array) -> tuple[Ints, Ints, Array]:
-    """Coordinate triplets sorted by row and column, equal places added."""
+    """Coordinate triplets sorted by row and column, duplicates added."""
     order = np.lexsort((columns, rows))
     rows, columns, values = rows[order], columns[order], values[order]
     new = np.ones(len(rows), dtype=bool)

@@ -214,7 +214,7 @@ class RigidRows:
         assert basis is not None
         known = np.zeros((config.n_owned, 1 + 3 * g))
         known[s.nodes] = np.column_stack([np.ones(len(s.nodes)), s.X, self.eliminated, self.equations.gap.reshape(-1, g)])
-        # the terms of an equation, that of its own node first
+        # the terms of an equation, with its own node first
         m = len(eq)
         row = np.concatenate([np.arange(m), eq.row])
         node = np.concatenate([config.to_global(eq.node), eq.followed])
@@ -246,13 +246,13 @@ class RigidRows:
         return float((np.abs(eq.gap) / size)[eq.active].max(initial=0.0))
 
     def curvature(self, forces: Array) -> tuple[Ints, Array] | None:
-        """What turning forces add to the tangent, from those of the coupling ``(n_owned, gdim)`` (collective).
+        """Geometric stiffness of the rotating rows, from the forces of the coupling ``(n_owned, gdim)`` (collective).
 
-        Rows at forces f_i turn by a turn t as ``sum r_i x f_i`` does: by ``(sum r_i f_i' - r_i . f_i) t``, with arms from the point, where
-        loads and reactions act.
+        A rotation t changes the moment ``sum r_i x f_i`` by ``(sum r_i f_i' - r_i . f_i) t``, with arms r_i from the point at which loads
+        and reactions act.
 
         Returns:
-            Global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``, on one rank; None without any.
+            Global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``, on one rank; None if there is none.
         """
         s, config, g, added = self.set, self._config, self._config.gdim, self.coupling.added
         if not s.large or self._basis is None or not len(self._basis.node):
@@ -269,7 +269,7 @@ class RigidRows:
         return self._at_basis(G)
 
     def added_mass(self, factor: float | None = None) -> tuple[Ints, Array] | None:
-        """The mass at the point times a factor, by default that of the step in time, as ``curvature`` has it; None without any."""
+        """The mass at the point times a factor, by default of the time step, in the format of ``curvature``; None without mass."""
         added, basis = self.coupling.added, self._basis
         if added is None or basis is None or not len(basis.node) or (factor is None and not added.factor):
             return None
@@ -289,17 +289,17 @@ class RigidRows:
     # -- motion in time ----------------------------------------------------------------------------------------------------
 
     def rates(self, times_mass: Callable[[Array], Array], v: Array, a: Array) -> tuple[Array, Array]:
-        """Velocity and acceleration that the set has as a rigid body, with the same momentum and its rate (collective).
+        """Velocity and acceleration of the set as a rigid body, with the same momentum and rate of momentum (collective).
 
-        Rules of integration that act on each node keep the distances of nodes, not their rates. What is added at the point gets its own.
+        Integrators act on each node: distances of nodes stay constant, but their rates do not vanish. The added mass gets its own rates.
 
         Args:
             times_mass: multiplies a field at the owned nodes by the mass ``(n_owned, gdim)`` (collective).
             v: velocity of the owned nodes ``(n_owned, gdim)``.
-            a: likewise, of their acceleration.
+            a: acceleration of the owned nodes ``(n_owned, gdim)``.
 
         Returns:
-            Those of the set's nodes ``(n, gdim)``, as they were where the set has no mass of its own.
+            Velocity and acceleration of the set's nodes ``(n, gdim)``, unchanged if the set has no mass of its own.
         """
         s, config, g, added = self.set, self._config, self._config.gdim, self.coupling.added
         u, nodes, comm = config.displacement[: config.n_owned], s.nodes, self._config.comm
@@ -314,7 +314,7 @@ class RigidRows:
             return v[nodes], a[nodes]
         if added is not None:
             G = G + added.mass_of(at) * np.outer(scale, scale)
-        # masses of the order of 1 beside rows
+        # masses scaled to the order of 1, like the rows
         size = np.trace(G)
         G = G / size
         basis = self._told_by(at, C)
@@ -322,13 +322,13 @@ class RigidRows:
         rows = np.concatenate([C, self._rows_of(basis, at)[held]])
 
         def rigid(field: Array, of_point: Array) -> Array:
-            """The motion ``(n_z,)`` with the momentum of fields ``(n_owned, gdim)`` and at the point, and with what is prescribed of it."""
+            """The motion ``(n_z,)`` with the momentum of fields ``(n_owned, gdim)`` and at the point, and its prescribed components."""
             momentum, sums = (reduced(comm, np.einsum("ngz,ng->z", X, field[nodes])) for X in (W, V))
             if added is not None:
                 momentum = momentum + scale * added.momentum_of(at, of_point)
             momentum = momentum / size
             if alone:
-                # its own displacements tell what is prescribed
+                # without mass of the nodes, the prescribed components follow from the added mass
                 return scale * np.asarray(np.linalg.lstsq(G, momentum, rcond=None)[0], dtype=float)
             known = C @ np.linalg.solve(plain, sums)
             given = basis.halo.take(field.__getitem__)[np.arange(len(basis.node)), basis.component][held]
@@ -349,25 +349,25 @@ class RigidRows:
         added.change_rates(added.motions(at) @ z, added.motions(at) @ dz + at_point)
         return (v[nodes], a[nodes]) if alone else (velocities(arms) @ z, velocities(arms) @ dz + bend)
 
-    # -- what is left ------------------------------------------------------------------------------------------------------
+    # -- components that the set keeps -------------------------------------------------------------------------------------
 
     def _rows_of(self, basis: Basis, at: Placement) -> Array:
-        """Rows B of the components that are left ``(k, n_z)``."""
+        """Rows B of the components q ``(k, n_z)``."""
         return (velocities(at.arms(basis.X)) * self.set.scale)[np.arange(len(basis.node)), basis.component]
 
     def _told_by(self, at: Placement, C: Array) -> Basis:
-        """Components that tell the motion together with C, those of before as long as they do so well enough (collective)."""
+        """Components q that determine the motion together with C, unchanged as long as they are well conditioned (collective)."""
         if self._basis is not None and _told(np.concatenate([self._rows_of(self._basis, at), C])) < TOLD_WORSE * self._basis.told:
             self._basis = None
         if self._basis is None:
             self._basis = self._choose(at, C)
             at_nodes = self._config.to_global(self.set.nodes)[:, None, None] == self._basis.node
-            #: Components of this rank's nodes that are left ``(n, gdim)``.
+            #: Mask of the components q of this rank's nodes ``(n, gdim)``.
             self._left: Bools = (at_nodes & (np.arange(self._config.gdim)[:, None] == self._basis.component)).any(axis=2)
         return self._basis
 
     def _choose(self, at: Placement, C: Array) -> Basis:
-        """Components that tell the motion together with C, each as far from those before it as can be (collective).
+        """Components q that determine the motion together with C, each with the largest row orthogonal to the previous rows (collective).
 
         Raises:
             SurfaceError: if there are too few.
@@ -385,7 +385,7 @@ class RigidRows:
                 largest = float(reduced(config.comm, size.max(initial=0.0), op=MPI.MAX))
                 if largest <= DEPENDENT:
                     break
-                # of those that are alike the first in place, on any number of ranks
+                # of equal candidates the first by position, on any number of ranks
                 node, component = np.nonzero(size >= (1.0 - NEAR) * largest)
                 order = np.lexsort([component, *places[node].T[::-1]])[:1]
                 offer = np.full(2 * g + 2 + across.shape[2], np.inf)
@@ -408,13 +408,13 @@ class RigidRows:
 
 
 def _without(rows: Array, row: Array) -> Array:
-    """Rows ``(..., n)`` without what they have along another one."""
+    """Rows ``(..., n)`` without their components along another row."""
     q = row / np.linalg.norm(row)
     return rows - (rows @ q)[..., None] * q
 
 
 def _told(rows: Array) -> float:
-    """Least singular value."""
+    """Smallest singular value."""
     return float(np.linalg.svd(rows, compute_uv=False)[-1])
 
 

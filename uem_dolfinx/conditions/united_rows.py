@@ -1,4 +1,4 @@
-"""Linear equations of users as uniting equations that hold always, with right-hand sides that follow loads and steps."""
+"""Linear equations of users as constraint equations that are always active, with right-hand sides that follow loads and steps."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ class UnitedRows:
         config: configuration of the displacement.
         declared: the equations as users declared them.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
-        contactors: owned nodes of contacts, which are eliminated where nothing else can be ``(n_owned,)``.
-        loaded: Constants that the load sets; values of others grow along with the Dirichlet values.
-        at: load factor or time at which functions are asked for their values first.
+        contactors: mask of owned nodes of contacts, which are eliminated only if no other node can be ``(n_owned,)``.
+        loaded: Constants that the load sets; other values are ramped with the Dirichlet values.
+        at: load factor or time of the first evaluation of functions.
 
     Attributes:
         equations: of this rank, with the gaps of the last call of ``at_present``.
-        multipliers: forces of the equations along what they eliminate ``(m,)``, as last taken.
-        turns: nothing that a checkpoint would have to keep.
-        turning: they do not depend on where the bodies are.
-        rigid: nor make they anything rigid.
+        multipliers: forces of the equations along their eliminated components ``(m,)``, as last set.
+        turns: rotations for checkpoints, here empty.
+        turning: whether rows depend on the displacement, here False.
+        rigid: rigid couplings, here None.
 
     Raises:
-        ConflictError: for equations that leave nothing to eliminate, or follow from others or contradict them.
+        ConflictError: for equations without a component to eliminate, and for equations that follow from others or contradict them.
     """
 
     turning = False
@@ -70,16 +70,16 @@ class UnitedRows:
         left = self._left
         self._left_halo = Halo(config, left.node)
         grows = np.repeat(ramped, counts)
-        #: Rows whose values grow along with the Dirichlet values, and likewise of those left out.
+        #: Mask of rows whose values are ramped with the Dirichlet values, and the same for the equations that were left out.
         self._ramped = np.asarray(self._weights[:, ~grows].getnnz(axis=1) == 0), grows[left.value]
-        #: What the left-hand sides were where the ramp began, of rows and of those left out, and how far it has come.
+        #: Left-hand sides at the beginning of the ramp, of rows and of equations left out, and the fraction of the ramp.
         self._start, self._fraction = (np.zeros(len(self.equations)), np.zeros(len(left))), 1.0
         self.multipliers: Array = np.zeros(len(self.equations))
         self.take_load(at)
         self._wanted = self._values()
 
     def _make(self, first: Ints, free: Bools, contactors: Bools) -> None:
-        """Choose what each equation eliminates (collective)."""
+        """Choose the component that each equation eliminates (collective)."""
         config = self._config
         parts = [one.rows(config, f"equations[{i}]") for i, one in enumerate(self._declared)]
         item = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
@@ -91,7 +91,7 @@ class UnitedRows:
         spared = config.ask_owners(rows.node, contactors[:, None].astype(float))[:, 0] > 0
         chosen = singles(config, rows, size, spared)
         alone, shared = chosen >= 0, able & (chosen < 0)
-        # terms of those alone are renumbered
+        # terms of independent equations are renumbered
         place = np.cumsum(alone[rows.row]) - 1
         g = config.block
         own = chosen[alone]
@@ -106,7 +106,7 @@ class UnitedRows:
         self._take(solved)
 
     def _refuse(self, rows: GivenRows, item: Ints, which: Bools, words: str) -> None:
-        """Raise if any of these is an equation that says what it should not (collective)."""
+        """Raise a ConflictError with ``words`` if any of these rows belongs to a firm equation (collective)."""
         firm = np.array([one.firm for one in self._declared], dtype=bool)
         bad, error = np.flatnonzero(which & firm[item]), None
         X = self._config.ask_owners(rows.node, self._config.X[: self._config.n_owned])
@@ -116,7 +116,7 @@ class UnitedRows:
         agree(self._config.comm, error)
 
     def _sent(self, rows: Solved) -> Solved:
-        """Rows with one weight each, on the ranks that own the nodes that they eliminate (collective)."""
+        """Rows with one weight each, sent to the ranks that own their eliminated nodes (collective)."""
         comm, order = self._config.comm, np.argsort(rows.row, kind="stable")
         rank = self._config.owner_of(rows.pivot // self._config.block)
         counts = np.bincount(rows.row, minlength=len(rows.pivot))
@@ -126,7 +126,7 @@ class UnitedRows:
         return Solved(pivot, np.repeat(every, n_terms), column, entry, every, value, weight)
 
     def _take(self, solved: list[Solved]) -> None:
-        """Make uniting equations of independent rows whose nodes this rank owns."""
+        """Make constraint equations of independent rows whose nodes this rank owns."""
         from scipy.sparse import csr_matrix
 
         config, g = self._config, self._config.block
@@ -146,24 +146,24 @@ class UnitedRows:
             node, np.eye(g)[pivot % g], np.zeros(m), np.ones(m, dtype=bool), terms[:, 0], terms[:, 1], coefficients
         )
         self._weights = csr_matrix((weight, (weight_row, value)), shape=(m, self._n_values))
-        #: What rounding of displacements of size one makes of the gaps.
+        #: Size of the gaps for displacements of size one.
         self._size = 1.0 + np.bincount(terms[:, 0], np.abs(coefficients).sum(axis=1), m)
 
     # -- right-hand sides ------------------------------------------------------------------------------------------------
 
     def take_load(self, at: float) -> None:
-        """Ask functions for the values of a load factor or time; a UserFunctionError if one raises (collective)."""
+        """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
         for i, one in enumerate(self._declared):
             if callable(one.b) and not isinstance(one.b, fem.Constant):
                 self._asked[i] = ask_together(self._config.comm, f"the value of equations[{i}] at {at:.6g}", one.b, at)
 
     def given_values(self) -> dict[str, Any]:
-        """Right-hand sides as they are now, by name."""
+        """Present right-hand sides, by name."""
         now = [one.b if asked is None else asked for one, asked in zip(self._declared, self._asked)]
         return {f"the value of equations[{i}]": value for i, value in enumerate(now)}
 
     def _values(self) -> Array:
-        """Right-hand sides as they are now ``(n_values,)`` (collective)."""
+        """Present right-hand sides ``(n_values,)`` (collective)."""
         with agreed(self._config.comm):
             found = [
                 values_of(f"the value of equations[{i}]", one.b if asked is None else asked, one.n_values(self._config.block))
@@ -172,7 +172,7 @@ class UnitedRows:
         return np.concatenate(found)
 
     def begin_step(self, start: Array, fraction: float) -> None:
-        """Begin a step whose ramp began at a displacement of the owned nodes ``(n_owned, gdim)`` and goes so far (collective)."""
+        """Begin a step at a fraction of a ramp that started at a displacement of the owned nodes ``(n_owned, gdim)`` (collective)."""
         self._start, self._fraction = (self._sides(start), self._left_sides(start)), fraction
         self._wanted = self._values()
 
@@ -183,7 +183,7 @@ class UnitedRows:
         return np.einsum("mg,mg->m", eq.direction, u[eq.node]) - np.bincount(eq.row, there, len(eq))
 
     def _left_sides(self, u: Array) -> Array:
-        """Likewise of the equations that were left out."""
+        """Left-hand sides of the equations that were left out (collective)."""
         left = self._left
         there = np.einsum("kg,kg->k", left.coefficients, self._left_halo.take(u.__getitem__))
         return np.asarray(np.bincount(left.row, there, len(left)), dtype=float)
@@ -192,7 +192,7 @@ class UnitedRows:
         return np.where(ramped, start + self._fraction * (b - start), b) if self._fraction < 1.0 else b
 
     def place(self) -> None:
-        """Nothing: they are linear."""
+        """Nothing: the equations are linear."""
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Nothing, likewise."""
@@ -217,10 +217,10 @@ class UnitedRows:
         return float((np.abs(self.equations.gap) / self._size).max(initial=0.0))
 
     def check(self) -> None:
-        """Refuse values that contradict each other, or Dirichlet values: what follows from others must hold, too (collective).
+        """Refuse values that contradict each other or Dirichlet values: equations left out must be satisfied, too (collective).
 
         Raises:
-            ConflictError: naming the place.
+            ConflictError: names the position.
         """
         config, left = self._config, self._left
         if not reduced(config.comm, len(left)):

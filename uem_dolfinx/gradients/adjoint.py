@@ -1,28 +1,28 @@
-"""The united problem linearised at a state of equilibrium, forwards along changes of controls, and backwards from a functional.
+"""The constrained problem linearised at an equilibrium, forwards along changes of controls, and backwards from a functional.
 
-With the residual F of the bodies, contact forces ``T' lam`` and gaps g, a change m' of the controls moves the bodies by
+With the residual F of the bodies, contact forces ``T' lam`` and gaps g, a change m' of the controls changes the displacement by
 
     du = P dq + c(m'),    P'(K + G)P dq = -P' [ dF/dm m' + (K + G) c(m') ]
 
-where G is the curvature of the contact, and c what the Dirichlet values ask for. A functional J of u and m therefore has
+where G is the curvature of the contact, and c(m') the increment prescribed by the Dirichlet values. For a functional J of u and m,
 
     P'(K + G)P mu = P' dJ/du,    a = P mu                                              the adjoint problem
     dJ/dm m' = dJ/dm|u m' - a' dF/dm m' + [ dJ/du - (K + G)' a ]' c(m')
 
-Gaps see the places X of the nodes as they see u: with ``x' = du + X'`` in place of du,
+Gaps depend on positions X of the nodes in the same way as on u: with ``x' = du + X'`` in place of du,
 
     x' = P dq + c(X'),    P'(K + G)P dq = -P' [ (dF/dX - K) X' + (K + G) c(X') ]
     dJ/dX = dJ/dX|u - dJ/du - (dF/dX - K)' a + [ dJ/du - (K + G)' a ]' c
 
-Contact forces are read from the residual at the contactors, by L and the series S of P, and so are their changes. A functional of lam, too,
-has a further load that moves contactors against their targets, by which the forces of the adjoint problem are those that J asks for:
+Contact forces, and their changes, follow from the residual at the contactors, by L and the series S of P. If J also depends on lam, the
+adjoint problem has a further load w, a prescribed motion of contactors relative to their targets:
 
     lam' = L'S' [ (K + G) du + dF/dm m' ],    w = S L dJ/dlam
-    dJ/du + (K + G) w in place of dJ/du,    a - w in place of a where it meets dF/dm or dF/dX - K
+    dJ/du + (K + G) w in place of dJ/du,    a - w in place of a in products with dF/dm or dF/dX - K
 
-Parameters of a contact change gaps and contact forces alone: c closes the gaps, and what forces at the same multipliers change by counts
-as dF/dm. With friction Q is not P, ``a = Q mu`` with ``P'(K + G)'Q mu = P' dJ/du``, and (K + G)' stands for (K + G) in what goes back.
-Among other fields u is all of them; contacts, and the places of nodes, have a part in the displacement's rows alone.
+Parameters of a contact change gaps and contact forces only: c closes the gaps, and the change of forces at the same multipliers counts
+as dF/dm. With friction Q is not P, ``a = Q mu`` with ``P'(K + G)'Q mu = P' dJ/du``, and (K + G)' replaces (K + G) in the adjoint problem.
+In mixed problems u contains all fields; contacts and positions of nodes affect the rows of the displacement only.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ MORE_THAN_LEFT = 1e3
 
 
 class Motion(NamedTuple):
-    """What moves with changes of controls.
+    """Changes along a direction of controls.
 
     Attributes:
         du: change of the displacement, and of all other fields.
-        shape: of the places of the nodes where they were drawn.
-        reactions: of the forces that contacts and Dirichlet conditions bear, on the bodies.
+        shape: change of the positions of the nodes in the reference configuration.
+        reactions: change of the forces of contacts and Dirichlet conditions on the bodies.
     """
 
     du: fem.Function
@@ -81,7 +81,7 @@ _KEPT: WeakKeyDictionary[UnitedProblem, Derivatives] = WeakKeyDictionary()
 
 
 def _derivatives_of(problem: UnitedProblem) -> Derivatives:
-    """Of its residual and of functionals, those of the last gradient among them."""
+    """Derivatives of a problem's residual and of functionals, reused from its last gradient."""
     F, kept = problem.bodies.F, _KEPT.get(problem)
     if kept is None or kept.F is not F:
         kept = _KEPT[problem] = Derivatives(F, problem.u.function_space, problem.config.V)
@@ -90,15 +90,15 @@ def _derivatives_of(problem: UnitedProblem) -> Derivatives:
 
 
 class Linearised:
-    """The united problem linearised at the state of equilibrium, which is left as it was in the end (collective).
+    """The constrained problem linearised at the equilibrium, which is restored in the end (collective).
 
     Attributes:
         F: the residual in UFL.
-        derivatives: of it and of functionals.
+        derivatives: of F and of functionals.
         P: restriction matrix of the active contactors.
-        rows: their equations; ``equations`` are those of each contact.
+        rows: their equations; ``equations`` lists the equations of each contact.
         multipliers: of all equations of contacts, and of users ``(m,)``.
-        ramp: share that Dirichlet values have of those that they are led to, in the rows of vectors ``(n_rows, gdim)``.
+        ramp: shares of the Dirichlet values, see ``solve.taken``, in the rows of vectors ``(n_rows, gdim)``.
     """
 
     P: Restriction
@@ -109,7 +109,7 @@ class Linearised:
         self.problem, self.config = problem, problem.config
         self.ramp = in_rows(problem, problem.progress.taken.held if held is None else held)
         self.K = self._K_back = problem.bodies.tangent.K
-        # of the displacement's components here, which are the first of vectors
+        # number of the displacement's components on this rank, which come first in vectors
         self._n = problem.config.n_owned * problem.config.gdim
         self.F = problem.bodies.F
         self.derivatives = derivatives or _derivatives_of(problem)
@@ -126,14 +126,14 @@ class Linearised:
         system, state = self.problem.system, self._state()
         assert isinstance(system, BodySystem)
         self._refuse_other_parameters(state)
-        # no step begins: a factorisation of the same matrix goes on serving
+        # no step begins: a factorisation of the same matrix is reused
         system.linearise(state, 1)
         self.K, self.G = self.problem.bodies.tangent.K, system.curvature
         self._K_back = self.K if is_symmetric(self.K, self.config.unknowns) else transposed(self.K)
         self._tell_idle()
 
     def _state(self) -> BodyState:
-        """Equations and multipliers where the problem is (collective)."""
+        """Equations and multipliers of the present state (collective)."""
         bodies, system = self.problem.bodies, self.problem.system
         assert isinstance(system, BodySystem)
         bodies.wanted[:] = self.problem.u.x.array
@@ -165,7 +165,7 @@ class Linearised:
             )
 
     def _tell_idle(self) -> None:
-        """Count contactors at which functionals have a gradient on either side (collective)."""
+        """Warn of contactors at which functionals have two one-sided gradients (collective)."""
         bodies, system, idle = self.problem.bodies, self.problem.system, 0
         assert isinstance(system, BodySystem)
         for pair in system.pairs:
@@ -180,7 +180,7 @@ class Linearised:
 
     def __exit__(self, *error: object) -> None:
         solver = self.problem.solver
-        # multigrid learns from one matrix for the next, and steps may not depend on whether a gradient was asked for
+        # the hierarchy is rebuilt, since steps must not depend on whether a gradient was computed
         if solver.iterative or not solver.lasting or self._K_back is not self.K:
             self.problem.system.forget()
         self.problem.restore()
@@ -189,7 +189,7 @@ class Linearised:
         """Derivatives of a contact's pressures (collective).
 
         Raises:
-            InputError: where they have none.
+            InputError: if they do not exist.
         """
         if self.rows.independent is not None and self.rows.independent.found:
             raise InputError(
@@ -201,13 +201,13 @@ class Linearised:
     def lift(self, weights: dict[Contact, Array]) -> PETSc.Vec:
         """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective with weights)."""
         if not weights:
-            # what equations are replaced by that conflict may be of other ranks
+            # rows that replace conflicting equations may be on other ranks
             return self.config.vector()
         parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.equations)]
         return self.P.read_back(np.concatenate([np.zeros(0), *parts]))
 
     def vector(self, at_nodes: npt.ArrayLike = 0.0) -> PETSc.Vec:
-        """A vector with what the displacement's owned nodes have ``(n_owned, gdim)``, zero in other fields."""
+        """A vector with values at the displacement's owned nodes ``(n_owned, gdim)``, zero in other fields."""
         v = self.config.unknowns.vector()
         v.array[: self._n] = np.ravel(at_nodes)
         return v
@@ -224,7 +224,7 @@ class Linearised:
         return self.P.expand(dq)
 
     def held(self, v: PETSc.Vec) -> PETSc.Vec:
-        """Without what bodies that contact alone holds move along it, where steps leave them; its own transpose (collective)."""
+        """A vector without open rigid motions of bodies that only contact holds; a symmetric projection (collective)."""
         assert isinstance(self.problem.system, BodySystem)
         out = v.copy()
         out.array[: self._n] = self.problem.system.floating.without_open_motions(np.array(v.array_r[: self._n]))
@@ -253,13 +253,13 @@ class Linearised:
         return forms.product(self._K_back, a)
 
     def share(self, m: Control | ContactParameter) -> float:
-        """How much of a change of a control the state has seen: all of it, unless load steps lead it there."""
+        """Share of a control, see ``solve.taken``: 1 unless steps ramp it."""
         return self.problem.progress.taken.of(led_for(m))
 
     def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
-        """How gaps and the residual change with an entry of a contact's parameter, at the same displacement (collective).
+        """Derivatives of gaps and residual by an entry of a contact's parameter, at fixed displacement (collective).
 
-        A rigid surface that moves by b(x) leaves bodies behind as if it were at rest and these moved by -b, and rotates its forces.
+        A motion b(x) of a rigid surface is equivalent to a motion -b of the bodies, and a rotation of its forces.
 
         Returns:
             Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
@@ -288,7 +288,7 @@ class Linearised:
         return gaps, -pushed
 
     def moved(self, direction: Sequence[tuple[Control, Any]]) -> Motion:
-        """What moves with changes of controls (collective)."""
+        """Changes along a direction of controls (collective)."""
         config, bodies = self.config, self.problem.bodies
         forces, prescribed, shape = self.vector(), np.zeros(bodies.free_rows.shape), fem.Function(config.V)
         gaps = np.zeros_like(self.multipliers)
@@ -328,7 +328,7 @@ class Linearised:
         return f
 
     def pressed(self, contact: Contact, motion: Motion) -> fem.Function:
-        """How a contact's pressure changes with a motion (collective)."""
+        """Change of a contact's pressure with a motion (collective)."""
         slopes, k = self.pressures(contact), self.problem.contacts.index(contact)
         multipliers = self.P.multipliers(self.P.pass_on(motion.reactions))
         ends = np.cumsum([len(own) for own in self.equations])
@@ -339,7 +339,7 @@ class Linearised:
         return found
 
     def prescribed_by(self, m: Any, values: Array) -> Array:
-        """What the ``values`` of a control make of Dirichlet values in the rows of vectors, zero where free ``(n_rows, gdim)``."""
+        """Change of Dirichlet values with the ``values`` of a control, in the rows of vectors, zero where free ``(n_rows, gdim)``."""
         bodies, found = self.problem.bodies, []
         before = np.array(forms.values_of(m))
         for now in (values, 0.0 * values):
@@ -358,12 +358,12 @@ class Adjoint:
     Args:
         at: the problem, linearised.
         J: the functional.
-        pressing: contacts whose pressures it holds.
-        handed: derivative by the places of the owned nodes through what later steps remember of them ``(n_owned, gdim)``.
+        pressing: contacts whose pressures it contains.
+        handed: derivative by the positions of the owned nodes through the history of later steps ``(n_owned, gdim)``.
 
     Attributes:
-        a: what forces do to J, less what they do to contact forces by themselves, a Function of the problem's space.
-        left: derivative by a change of the displacement with everything else at rest, what the adjoint forces have not taken up.
+        a: adjoint displacement, the derivative of J by forces, minus the lift w, a Function of the problem's space.
+        left: residual of the adjoint problem: the derivative by a change of the displacement with everything else fixed.
         terms: J with its areas, and the work of the residual along a, with their signs.
         by_values: derivative of J by the prescribed value of every component of vectors, zero where free ``(n_rows, gdim)``.
     """
@@ -394,7 +394,7 @@ class Adjoint:
         self.left = drive - at.stiffness_back(whole)
         at.derivatives.along(config.from_rows(left.array_r))
         self.by_values = np.where(at.problem.bodies.free_rows, 0.0, at.P.carried_back(self.left))
-        #: Derivative by the places of the nodes, but for what J and F are integrals over ``(n_owned * gdim,)``.
+        #: Derivative by the positions of the nodes, without the shape derivatives of the integrals in J and F ``(n_owned * gdim,)``.
         by_places = (at.body_stiffness_back(left) - of_u + drawn).array_r + self.by_values.ravel()
         self._by_places = by_places[: config.n_owned * config.gdim]
 
@@ -404,7 +404,7 @@ class Adjoint:
         return -self.at.P.multipliers(self.at.P.pass_on(self.left))
 
     def by(self, m: Control | ContactParameter) -> Array | fem.Function:
-        """Derivative by a control."""
+        """Derivative by a control, of the type that ``gradient`` returns."""
         if isinstance(m, ContactParameter):
             return self._by_contact(m)
         if isinstance(m, fem.Constant):
@@ -433,7 +433,7 @@ class Adjoint:
     def _by_function(self, m: fem.Function) -> fem.Function:
         """A Function of its space."""
         found, added = self.at.derivatives.by_function(self.terms, m), fem.Function(m.function_space)
-        # conditions that take its values tell which
+        # Dirichlet values for the entries 1, 2, ... identify the entry that each of them takes
         which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
         own = which > 0.5
         np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, (self.at.ramp * self.by_values)[own])

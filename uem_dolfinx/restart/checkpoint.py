@@ -1,7 +1,7 @@
-"""Checkpoints: what a long run goes on from, in one file that any number of ranks can write and read.
+"""Checkpoints, from which long runs are restarted: one file, written and read by any number of ranks.
 
-The file is in the order of the mesh's input; every rank writes and reads its own part of it through MPI-IO, as the bytes that numbers
-have in memory.
+The file follows the input order of the mesh. Every rank writes and reads its own part through MPI-IO, in the binary format of numbers
+in memory.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from uem_dolfinx.restart.state import State
 #: Version of the file's layout and of the names in it.
 #: [format; -; test_checkpoint_refused.py::test_another_format]
 FORMAT = 8
-#: What a checkpoint begins with.
+#: First word of a checkpoint.
 MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table.
 #: [format; bytes; test_checkpoint_refused.py::test_damaged_files]
@@ -45,16 +45,16 @@ LEAVING = 30.0
 
 
 def write_checkpoint(path: str | Path, state: State) -> None:
-    """Write a state so that the file is complete or not there, whenever the run is killed (collective).
+    """Write a state; the file is either complete or absent, even if the run is killed (collective).
 
-    It is written to ``PATH.part``, which replaces the file when it is on the disk.
+    It is written to ``PATH.part``, which replaces the file when it is complete on the disk.
 
     Args:
         path: name of the file; its folder is made.
-        state: what is written.
+        state: state to write.
 
     Raises:
-        CheckpointError: if the disk or the system refuses, or the state holds what a checkpoint cannot; an earlier file stays.
+        CheckpointError: if writing fails, or the state contains objects that a checkpoint cannot hold; an earlier file stays.
     """
     path, comm = _of_state(path, state)
     for hook in state.collect:
@@ -102,16 +102,16 @@ def write_checkpoint(path: str | Path, state: State) -> None:
 
 
 def read_checkpoint(path: str | Path, state: State) -> None:
-    """Put everything back into a state that was made like the one written (collective).
+    """Read a checkpoint into a state that was made like the one written (collective).
 
-    Nothing is changed unless the whole file is sound and belongs to this mesh, these functions, contacts and numbers.
+    Nothing is changed unless the whole file is intact and belongs to this mesh, these functions, contacts and numbers.
 
     Args:
         path: name of the file.
-        state: what is overwritten.
+        state: state to overwrite.
 
     Raises:
-        CheckpointError: with the file, the expectation, its contents and a remedy.
+        CheckpointError: with the file, the expected and the found contents, and a remedy.
     """
     path, comm = _of_state(path, state)
     for hook in state.collect:
@@ -128,7 +128,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
         with trouble:
             file = MPI.File.Open(comm, str(path), MPI.MODE_RDONLY)
         trouble.agree()
-        # the first time for the hash alone: a damaged file must not leave half of itself behind
+        # the first pass computes the hash only, so that a damaged file changes nothing
         found = fingerprint(comm, [hashes(part) for part in _parts(file, state, trouble)])
         with trouble:
             if trouble.none and found != content["data"]:
@@ -150,7 +150,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
 
 
 def _of_state(path: Any, state: Any) -> tuple[Path, MPI.Comm]:
-    """The path of a checkpoint, and the communicator of its state; InputTypeError or InputError if they are none (collective)."""
+    """The path of a checkpoint, and its state's communicator; InputTypeError or InputError if they are invalid (collective)."""
     given.kind("state", state, isinstance(state, State), "a State, as problem.state()")
     with agreed(state.comm):
         for name, f in state.functions.items():
@@ -159,7 +159,7 @@ def _of_state(path: Any, state: Any) -> tuple[Path, MPI.Comm]:
 
 
 def _beside(path: Path) -> Path:
-    """Where a checkpoint is written before it takes its place."""
+    """Temporary file of a checkpoint, which replaces the file when complete."""
     return path.with_name(path.name + ".part")
 
 
@@ -188,7 +188,7 @@ def _plain(value: Any) -> Any:
 
 
 def _text(content: dict[str, Any]) -> bytes:
-    """Content in JSON; a CheckpointError names the number that is none."""
+    """Content in JSON; a CheckpointError names the entry that JSON cannot hold."""
     for name, value in content["numbers"].items():
         try:
             json.dumps(value, default=_plain)
@@ -201,7 +201,7 @@ def _text(content: dict[str, Any]) -> bytes:
 
 
 def _head(end: int, text: bytes) -> bytes:
-    """What the file begins with: where the tables end and the content follows, and the content's hash."""
+    """Head of the file: the end of the tables, where the content begins, its length and its hash."""
     line = f"{MAGIC}\nformat {FORMAT}\ncontent {end} {len(text)} {blake2b(text, digest_size=DIGEST).hexdigest()}\n"
     return line.encode().ljust(HEAD - 1) + b"\n"
 
@@ -212,7 +212,7 @@ def _damaged(path: Path, expected: str, found: str) -> CheckpointError:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Content of a checkpoint; a CheckpointError tells what is not whole, the tables aside."""
+    """Content of a checkpoint; a CheckpointError describes any damage outside the tables."""
     try:
         with path.open("rb") as file:
             head, size = file.read(HEAD), path.stat().st_size
@@ -242,7 +242,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _compare(path: Path, found: dict[str, str], expected: dict[str, str]) -> None:
-    """Refuse a checkpoint of another state by a CheckpointError that names the first thing that differs."""
+    """Refuse a checkpoint of another state by a CheckpointError that names the first difference."""
     for name in [*expected, *found]:
         if found.get(name) != expected.get(name):
             raise CheckpointError(
@@ -252,9 +252,9 @@ def _compare(path: Path, found: dict[str, str], expected: dict[str, str]) -> Non
 
 
 def _compare_settings(path: Path, found: dict[str, str], state: State) -> None:
-    """Refuse a checkpoint of a run that was made with something else by a CheckpointError that names all that differs.
+    """Refuse a checkpoint of a run with other settings by a CheckpointError that lists all differences.
 
-    A setting that the file does not know of, as one that came later, was by default then.
+    A setting that is missing in the file, e.g. because it was added later, is taken to have had its default value.
     """
     expected = state.settings
     others = [
@@ -272,22 +272,22 @@ def _compare_settings(path: Path, found: dict[str, str], state: State) -> None:
 class Checkpoint(given.Sealed):
     """Stores a run's state in a file, so that the same script resumes where it was killed.
 
-    As a context manager, and while load or time steps run with it, it takes care of Ctrl-C and of SIGTERM, which batch systems send
-    before they kill: whichever rank gets it, all finish the step, or the iteration where load and time steps are in one, write the last
-    state, and raise KeyboardInterrupt or end with exit status 143. Between steps it costs one number sent around.
+    As a context manager, and during load or time steps, it handles Ctrl-C and SIGTERM, which batch systems send before they kill a run.
+    If any rank receives a signal, all ranks finish the step, or the present iteration of load and time steps, and write the last state.
+    Then they raise KeyboardInterrupt or end with exit status 143. The cost is one reduction per step.
 
         with uem.Checkpoint("out/run.uem", every=50) as checkpoint:
             for step in uem.time_steps(problem, dt, end, checkpoint=checkpoint):
                 ...
 
-    If the loop or the block is left before its end, by ``break``, ``return``, an error of the script or a step that fails, the last
-    converged step is written, if all ranks leave there. A second Ctrl-C ends the run at once, with the previous file.
+    If all ranks leave the loop or the block before its end, by ``break``, ``return``, an error of the script or a failed step, the last
+    converged step is written. A second Ctrl-C ends the run at once, with the previous file.
 
     Other loops call ``begin(state)`` before the first step, ``step()`` after each, and ``finish()`` at the end.
 
     Args:
         path: name of the file.
-        every: number of steps from one writing to the next.
+        every: number of steps between writes.
 
     Raises:
         InputError, InputTypeError: if ``every`` is no positive number of steps.
@@ -297,20 +297,20 @@ class Checkpoint(given.Sealed):
         given.kind("path", path, isinstance(path, (str, os.PathLike)), "the path of a file")
         self.path, self.every = Path(path), given.count("every", every)
         self._state: State | None = None
-        #: Whether steps have been made since the last writing, and whose caller has one that it is not done with.
+        #: Whether steps have been made since the last write, and the loop whose caller still works on a step.
         self._unwritten, self._loop = False, None  # type: bool, object
-        #: Signals that ask the run to end.
+        #: Signals to end the run.
         self.interruption = Interruption(finishing=True)
 
     def begin(self, state: State) -> bool:
         """Resume from the file if it exists, and remove the incomplete file of a killed run (collective).
 
         Returns:
-            Whether the state is that of the file now.
+            Whether the state has been read from the file.
 
         Raises:
-            CheckpointError: if there is a file that is damaged or belongs to another run, or if the checkpoint has begun with the
-                state of another problem.
+            CheckpointError: if the file is damaged or belongs to another run, or if the checkpoint has begun with the state of
+                another problem.
         """
         given.kind("state", state, isinstance(state, State), "a State, as problem.state()")
         if self._state is not None:
@@ -330,7 +330,7 @@ class Checkpoint(given.Sealed):
         return True
 
     def check(self, *functions: Any) -> None:
-        """Refuse Functions none of which is in the state that is kept, by a CheckpointError: those of another problem."""
+        """Raise a CheckpointError if none of the Functions belongs to the state, since they are of another problem."""
         kept = [] if self._state is None else list(self._state.functions.values())
         if functions and not any(f is known for f in functions for known in kept):
             raise CheckpointError(
@@ -339,15 +339,15 @@ class Checkpoint(given.Sealed):
 
     @property
     def begun(self) -> bool:
-        """Whether there is a state to keep."""
+        """Whether the checkpoint has a state."""
         return self._state is not None
 
     def step(self) -> None:
-        """Count a step that is done, and write the state when it is time (collective).
+        """Count a completed step, and write the state after every ``every`` steps (collective).
 
         Raises:
             CheckpointError: if it cannot be written; an earlier file stays.
-            KeyboardInterrupt, SystemExit: after writing, if any rank has got Ctrl-C or SIGTERM.
+            KeyboardInterrupt, SystemExit: after writing, if any rank has received Ctrl-C or SIGTERM.
         """
         if self._state is None:
             raise CheckpointError(f"{self.path}: there is no state to keep yet; call begin(state) before the first step")
@@ -364,7 +364,7 @@ class Checkpoint(given.Sealed):
 
         Raises:
             CheckpointError: if it cannot be written; an earlier file stays.
-            KeyboardInterrupt, SystemExit: after writing, if any rank has got Ctrl-C or SIGTERM.
+            KeyboardInterrupt, SystemExit: after writing, if any rank has received Ctrl-C or SIGTERM.
         """
         if self._state is not None:
             number = self.interruption.agreed(self._state.comm)
@@ -382,11 +382,11 @@ class Checkpoint(given.Sealed):
         self._loop = loop
 
     def leave(self, error: BaseException | None, loop: object = None) -> None:
-        """Write the last step that is done where a loop or the ``with`` block is left before its end, if all ranks leave (collective).
+        """Write the last completed step when all ranks leave a loop or the ``with`` block before its end (collective).
 
         Args:
-            error: by which it is left; None for none.
-            loop: that is left, if it is one which hands out steps; nothing is written where another one has begun since.
+            error: exception that ends the block, or None.
+            loop: the loop of steps that is left, or None; nothing is written if another loop has begun since.
 
         Raises:
             CheckpointError: if there is no other error and it cannot be written; an earlier file stays.

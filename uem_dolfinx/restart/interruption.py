@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: noted when they come, on whichever rank, and acted on where all ranks have come to the same place."""
+"""Ctrl-C and SIGTERM: noted when they arrive, on any rank, and acted on when all ranks have reached the same point."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ T = TypeVar("T")
 #: Exit status of a run that has ended on SIGTERM, as shells have it.
 #: [format; exit status; test_checkpoint_in_steps.py::test_terminated]
 TERMINATED = 128 + signal.SIGTERM
-#: What is noted, unless it is ignored.
+#: Signals that are noted, unless they are ignored.
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class InterruptedStepError(UEMError):
-    """A signal has come within a step; never leaves the load and time stepping.
+    """A signal has arrived within a step; always caught by the load and time stepping.
 
     Attributes:
         number: of the signal.
@@ -38,12 +38,12 @@ class InterruptedStepError(UEMError):
 
 
 class Interruption:
-    """Signals that ask a run to end, noted within its ``with`` block; Ctrl-C after one does at once what it would have done outside.
+    """Signals to end a run, noted within its ``with`` block; a further Ctrl-C has its usual effect at once.
 
-    Blocks may stand within each other. Python allows handlers in the main thread only; elsewhere nothing is noted.
+    Blocks may be nested. Python allows signal handlers in the main thread only; in other threads no signal is noted.
 
     Args:
-        finishing: whether the script's steps within the block are finished first: blocks within it leave signals to it.
+        finishing: whether the script's steps within the block are finished first; nested blocks then do not handle signals.
     """
 
     def __init__(self, finishing: bool = False) -> None:
@@ -53,7 +53,7 @@ class Interruption:
     def __enter__(self) -> Self:
         self._depth += 1
         if self._depth == 1 and threading.current_thread() is threading.main_thread():
-            # what is ignored stays so, and what C code handles cannot be put back
+            # ignored signals stay ignored, and handlers of C code could not be restored
             before = {number: signal.getsignal(number) for number in SIGNALS}
             kept = {number for number, was in before.items() if was in (signal.SIG_IGN, None) or _finishes(was)}
             self._before = {number: was for number, was in before.items() if number not in kept}
@@ -66,12 +66,12 @@ class Interruption:
         if self._depth:
             return
         for number, before in self._before.items():
-            # someone else may have come since
+            # other code may have set its own handler since
             if signal.getsignal(number) == self._note:
                 signal.signal(number, before)
         asked, self._asked = self._asked, 0
         if asked:
-            # no rank has acted on it
+            # the signal has not been acted on
             signal.raise_signal(asked)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
@@ -80,7 +80,7 @@ class Interruption:
             logger.warning("%s: the run ends after this iteration or step; Ctrl-C ends it at once", signal.Signals(number).name)
             return
         if self._depth and number == signal.SIGTERM:
-            # some senders tell both the process and its group
+            # some senders signal both the process and its group
             return
         self._asked, before = 0, self._before[number]
         if callable(before):
@@ -90,36 +90,36 @@ class Interruption:
             signal.raise_signal(number)
 
     def agreed(self, comm: MPI.Comm) -> int:
-        """Number of a signal that any rank has got since it was asked last, 0 without one (collective)."""
+        """Number of a signal that any rank has received since the last call, 0 without one (collective)."""
         number = int(reduced(comm, self._asked, op=MPI.MAX))
         if number:
             self._asked = 0
         return number
 
     def check_signals(self, comm: MPI.Comm) -> None:
-        """Raise ``InterruptedStepError`` on all ranks if any has got a signal (collective)."""
+        """Raise ``InterruptedStepError`` on all ranks if any rank has received a signal (collective)."""
         number = self.agreed(comm)
         if number:
             raise InterruptedStepError(number)
 
 
 def _finishes(handler: Any) -> bool:
-    """Whether a handler is that of a block whose steps are finished first."""
+    """Whether a handler belongs to a block that finishes its steps first."""
     block = getattr(handler, "__self__", None)
     return isinstance(block, Interruption) and block._finishing
 
 
 def end_run(number: int, kept: str) -> NoReturn:
-    """End a run on a signal that all ranks know of, with a word about what is kept: KeyboardInterrupt, or SystemExit with status 143."""
+    """End a run on a signal known to all ranks, and log the saved results: KeyboardInterrupt, or SystemExit with status 143."""
     logger.warning("ended by %s; %s", signal.Signals(number).name, kept)
     raise mark_as_agreed(KeyboardInterrupt() if number == signal.SIGINT else SystemExit(TERMINATED)) from None
 
 
 def end_together(comm_of: Callable[..., MPI.Comm | None]) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Decorate what is collective and takes long, so that a signal to any rank within ends the run on all at its end.
+    """Decorate a long collective function, so that a signal to any rank during the call ends the run on all ranks after it.
 
     Args:
-        comm_of: the communicator, from the same arguments; None if they are not what they should be.
+        comm_of: returns the communicator from the same arguments; None if they are invalid.
     """
 
     def decorate(f: Callable[P, T]) -> Callable[P, T]:

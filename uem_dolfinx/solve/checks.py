@@ -1,6 +1,6 @@
-"""What a problem is handed, looked at before anything is made of it: residual, Dirichlet conditions and their values.
+"""Checks of the arguments of a problem: residual, Dirichlet conditions and their values, laws with history.
 
-Each check looks at this rank's part; the caller has the ranks agree.
+Most checks concern this rank only; the caller makes the ranks agree.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ _taken: WeakValueDictionary[int, Any] = WeakValueDictionary()
 
 
 def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
-    """Refuse what is no residual: no form, an energy, one of another space or mesh, or not linear in its test function.
+    """Refuse a residual that is no form, an energy, of another space or mesh, or not linear in its test function.
 
     Args:
         F: a UFL form.
         u: displacement.
-        what: F is, for messages.
+        what: name of F in messages.
 
     Raises:
-        InputTypeError, InputError, SpaceError: each with the remedy.
+        InputTypeError, InputError, SpaceError: each with a remedy.
     """
     check_linear(what, F, u.function_space)
     check_parts(what, F, u)
@@ -50,7 +50,7 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
 
 
 def check_dynamics(dynamics: Any) -> Dynamics | None:
-    """The mass and motion that a problem has, if any.
+    """The dynamics of a problem, or None.
 
     Raises:
         InputTypeError: for anything else.
@@ -64,10 +64,10 @@ def check_dynamics(dynamics: Any) -> Dynamics | None:
 
 
 def check_checkpoint(checkpoint: Any) -> None:
-    """Refuse to step with anything else than a checkpoint, or None.
+    """Refuse anything but a Checkpoint or None.
 
     Raises:
-        InputTypeError: naming it.
+        InputTypeError: for other objects.
     """
     if checkpoint is not None:
         from uem_dolfinx.restart.checkpoint import Checkpoint
@@ -76,12 +76,12 @@ def check_checkpoint(checkpoint: Any) -> None:
 
 
 def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: int | None = None) -> list[HistoryMaterial]:
-    """The laws with history as a list: all that F is made of, each once, of this displacement or this part of u.
+    """The laws with history as a list: all laws in F, each once, of this displacement or this part of u.
 
     Raises:
         InputTypeError: if they are no list of laws with history.
-        InputError: if one stands in the list twice, F is not made of it, or F holds fields of one that is not in the list.
-        SpaceError: if one is of another displacement, or belongs to another problem.
+        InputError: if a law is listed twice or not used in F, or if F contains fields of a law that is not listed.
+        SpaceError: if a law is of another displacement, or belongs to another problem.
     """
     found: list[HistoryMaterial] = given.items(
         "materials", materials, is_history_material, "a material with history, as VonMises"
@@ -115,12 +115,12 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: 
 
 
 def take_materials(materials: Sequence[HistoryMaterial]) -> None:
-    """Let laws with history belong to the problem that has been made of them."""
+    """Mark laws with history as belonging to a problem."""
     _taken.update({id(material): material for material in materials})
 
 
 def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
-    """Raise an InputError of what a displacement among other fields cannot have, with a remedy."""
+    """Raise an InputError, with a remedy, unless the problem is of a displacement only."""
     if not config.moves:
         raise InputError(f"{what} are of a displacement, and u is a scalar field: expected a vector Lagrange space")
     if config.unknowns.mixed:
@@ -134,7 +134,7 @@ def check_conditions(config: Configuration, bcs: Any) -> list[Any]:
 
     Raises:
         InputTypeError: if they are no list of Dirichlet conditions.
-        SpaceError: naming the first that belongs elsewhere.
+        SpaceError: names the first condition of another space.
     """
     bcs = given.items("bcs", bcs, compat.is_dirichlet, "a Dirichlet condition")
     for i, bc in enumerate(bcs):
@@ -148,16 +148,16 @@ def check_conditions(config: Configuration, bcs: Any) -> list[Any]:
 
 
 def check_values(problem: Any, wanted: Array) -> None:
-    """Refuse values that a step cannot begin with (collective).
+    """Refuse invalid values at the beginning of a step (collective).
 
     Args:
-        problem: whose conditions and loads are set for the step.
+        problem: with conditions and loads set for the step.
         wanted: all unknowns with their Dirichlet values, ghosts included ``(n,)``.
 
     Raises:
-        NotFiniteError: for a Dirichlet value that is not finite, naming condition, value and place.
-        InputError: for Constants and numbers in the residual, Dirichlet conditions, points, couplings and equations that differ from rank
-            to rank, naming the first and two ranks.
+        NotFiniteError: for a Dirichlet value that is not finite, with its condition, value and position.
+        InputError: if Constants and numbers in the residual, Dirichlet conditions, points, couplings or equations differ between ranks,
+            with the first of them and two ranks.
     """
     with agreed(problem.comm):
         _check_finite(problem.config, problem.bodies.bcs, wanted)

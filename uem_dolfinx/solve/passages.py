@@ -1,13 +1,13 @@
-"""Refusal of steps that lead contactors through a body: they end on its other side, in an unreachable equilibrium.
+"""Refusal of steps in which contactors pass through a body and end on its other side, in an unreachable equilibrium.
 
-What counts is the converged step, not the iterates of Newton's method: the straight ways of contactors and target from the committed
-to the new configuration. A contactor passes if it enters the target in one place and leaves it in another that faces away from the
-first. One that only cuts an edge or a crest short, or slides past an end, comes to the same place by shorter steps; in motion it has
-missed a blow. One that touches at the end has come to the wrong face if it comes from behind this, or from the sector in front of
-both faces of an edge, where a straight way does not tell which of them it meets.
+The check uses the converged step, not the Newton iterates: straight paths of contactors and target from the committed to the new
+configuration. A contactor passes if it enters the target through one face and leaves it through another that faces away from the first.
+Contactors that only cut an edge or a crest, or slide past an end, are accepted in statics; in dynamics they have missed an impact. A
+contactor that touches at the end of the step has reached the wrong face if it comes from behind this face, or from the sector in front
+of both faces of an edge, since its straight path then does not determine which face it meets.
 
-Of a body that may touch itself ways are straight as seen from its facets, each of which turns with what is around it: a body that turns,
-rolls or bends by much does not come nearer to itself by that, and what is next to a facet on the surface goes with it.
+For a body that may touch itself, paths are straight relative to its facets, and each facet rotates with its surroundings. So a body that
+rotates, rolls or bends does not approach itself, and the surface around a facet moves with it.
 """
 
 from __future__ import annotations
@@ -48,24 +48,24 @@ LOOKING_AWAY = -0.5
 def refuse_passages(
     config: Configuration, pairs: Sequence[Interface], start: Array, motions: Sequence[Motion | None], moving: bool = False
 ) -> None:
-    """Refuse a step that leads a contactor through its target (collective).
+    """Refuse a step in which a contactor passes through its target (collective).
 
-    Steps within which nothing moves by half a facet, or half the thickness of a body of one cell, are not looked at.
+    Steps with motions below half a facet, or half the thickness of a body of one cell, are not examined.
 
     Args:
         config: configuration of the displacement at the end of the step.
-        pairs: of all contacts; those that keep their facets for a step cannot pass, nor can what is tied.
+        pairs: of all contacts; contactors that keep their facets for a step, and tied contactors, cannot pass.
         start: all unknowns at the beginning, ghosts included ``(n,)``.
         motions: of the pairs' rigid targets at the beginning.
-        moving: whether bodies have inertia, so that none may cut a crest short.
+        moving: whether bodies have inertia, so that contactors must not cut a crest.
 
     Raises:
-        TunnellingError: naming the deepest such contactor of the first rank that has one.
+        TunnellingError: names the deepest such contactor of the first rank that has one.
     """
     du = config.displacement - config.of(start)
     looked_at = [(pair, motion) for pair, motion in zip(pairs, motions) if pair.sliding == "finite"]
     ways = [_ways(pair, du, motion) for pair, motion in looked_at]
-    # of one contact: the longest ways of both sides, the sum of the target's and their number
+    # for each contact: the longest displacements of both sides, the sum of the target's displacements and their number
     mine = np.array(
         [[*(np.linalg.norm(w, axis=1).max(initial=0.0) for w in way), *way[1].sum(axis=0), len(way[1])] for way in ways]
     )
@@ -97,19 +97,19 @@ def refuse_passages(
 
 
 def _listed(target: Any) -> TypeGuard[Neighbour]:
-    """Whether contactors meet what is on a list of general contact alone."""
+    """Whether contactors search only the neighbour list of a general contact."""
     return hasattr(target, "neighbours")
 
 
 def _refuse(pair: Interface, by: Array, how: str, moving: bool, places: Array | None = None) -> None:
-    """Raise if a contactor has passed, by a length that is positive ``(n,)``, at some place (collective).
+    """Raise if a contactor has passed, by a positive length ``(n,)`` (collective).
 
     Args:
         pair: the contact.
         by: the lengths.
-        how: what is told of them, and of the places.
-        moving: as of ``refuse_passages``.
-        places: in the reference configuration ``(n, gdim)``, if they are told.
+        how: sentence with placeholders for the length and the position.
+        moving: as in ``refuse_passages``.
+        places: positions in the reference configuration ``(n, gdim)`` for the message, or None.
     """
     error = None
     if (by > 0.0).any():
@@ -121,7 +121,7 @@ def _refuse(pair: Interface, by: Array, how: str, moving: bool, places: Array | 
 
 
 def _ways(pair: Interface, du: Array, motion: Motion | None) -> tuple[Array, Array]:
-    """Ways of the contactors, relative to a rigid target, and of the nodes of a meshed one, ``(n, gdim)`` each."""
+    """Displacements of the contactors, relative to a rigid target, and of the nodes of a meshed target, ``(n, gdim)`` each."""
     way, now = du[pair.nodes], pair.target.motion
     if motion is not now:
         still = Motion.none(du.shape[1])
@@ -134,12 +134,12 @@ def _ways(pair: Interface, du: Array, motion: Motion | None) -> tuple[Array, Arr
 
 
 def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, moving: bool) -> Array:
-    """How deep contactors that pass are in a mesh, from displacements ``du (n_local, gdim)`` relative to its mean ``(n,)`` (collective)."""
+    """Depth of passing contactors in a mesh ``(n,)``, from displacements ``du (n_local, gdim)`` relative to its mean (collective)."""
     comm, points, way = pair.config.comm, pair.points, du[pair.nodes]
     moved = du[target.dofs]
     length = np.linalg.norm(way, axis=1) + max(comm.allgather(np.linalg.norm(moved, axis=2).max(initial=0.0)))
     reach = PASSAGE_DEPTH * target.stride
-    # only those that the target could have met on its way
+    # only contactors that the target could have met
     p = pair.projection
     follow = target.behind_others if _listed(target) else ~pair.tied
     near = np.flatnonzero((length > target.stride) & follow & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
@@ -150,7 +150,7 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     found = cross_target(target, near, (x - way[near], x), (ends - moved, ends), reach, target.told(near), target.may_touch)
     entry, out, inside = _inside(found, length[found.point], reach, moving & ~pair.trial.active)
     np.maximum.at(depth, found.point[entry], inside)
-    # those that leave without having entered began inside, or on a curved facet that its pieces cut short
+    # contactors that leave without having entered began inside, or on a curved facet outside its flat pieces
     i = np.unique(found.point[out])
     if any(comm.allgather(len(i))):
         i = found.point[out]
@@ -164,12 +164,12 @@ def _inside(found: Crossings, way: Array, reach: float, at_all: Bools) -> tuple[
 
     Args:
         found: crossings.
-        way: lengths of the contactors' ways ``(k,)``.
-        reach: length by which contactors that pass are inside at least.
-        at_all: contactors that pass if they leave by any face ``(n,)``; others by one that looks away.
+        way: lengths of the contactors' paths ``(k,)``.
+        reach: minimum depth of a passage.
+        at_all: mask of contactors that pass if they leave by any face ``(n,)``; others pass if the face looks away.
 
     Returns:
-        Crossings by which they enter, those by which contactors leave that have not entered, and how deep the first were inside.
+        Crossings by which passing contactors enter, crossings by which others leave without having entered, and the former's depths.
     """
     entry, leaving, out = entries_and_exits(found)
     cosine = _dot(found.normal[entry], found.normal[leaving])
@@ -180,16 +180,16 @@ def _inside(found: Crossings, way: Array, reach: float, at_all: Bools) -> tuple[
 
 
 def _through_itself(pair: Interface, target: Neighbour, du: Array, moving: bool) -> tuple[Array, Ints]:
-    """How deep contactors that pass are in their own body, and the facets by which they enter, ``(n,)`` each (collective).
+    """Depth of passing contactors in their own body, and the facets by which they enter, ``(n,)`` each (collective).
 
-    Only those near which their own body is on a list are looked at, and only if the body does not merely move as one. What tells are
-    ways as seen from the facets: what is around a node on the surface goes with it, however far it moves and turns.
+    Only contactors with their own body on their neighbour list are examined, and only if the body deforms. Paths are relative to the
+    facets, since the surface around a node moves and rotates with it.
 
     Args:
         pair: the contact.
         target: its target.
         du: displacements in the step ``(n_local, gdim)``.
-        moving: as of ``refuse_passages``.
+        moving: as in ``refuse_passages``.
     """
     config, skin, which = pair.config, target.neighbours.skin, target.beside_themselves
     depth, facet = np.zeros(len(pair.nodes)), np.full(len(pair.nodes), -1)
@@ -206,7 +206,7 @@ def _through_itself(pair: Interface, target: Neighbour, du: Array, moving: bool)
         target.of_itself, turning=True,
     )  # fmt: skip
     entry, _, inside = _inside(found, found.way, reach, moving & ~pair.trial.active)
-    # of several the deepest comes last, and stays
+    # the deepest of several passages is last, and is kept
     order = np.argsort(inside, kind="stable")
     i = found.point[entry[order]]
     depth[i], facet[i] = inside[order], found.facet[entry[order]]
@@ -214,7 +214,7 @@ def _through_itself(pair: Interface, target: Neighbour, du: Array, moving: bool)
 
 
 def _normals_at_start(pair: Interface, target: MeshTarget, start: Array, which: Ints) -> Array:
-    """Normals of the target at contactors ``which (k,)`` that began on it or inside, zero for others ``(k, gdim)`` (collective)."""
+    """Normals of the target at contactors ``which (k,)`` that began on or inside it, zero for others ``(k, gdim)`` (collective)."""
     with pair.config.at(start):
         p = target.project(pair.points[which], which)
     began = pair.committed.active[which] | (p.gap < 0.0)
@@ -222,11 +222,11 @@ def _normals_at_start(pair: Interface, target: MeshTarget, start: Array, which: 
 
 
 def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array, Array]:
-    """Where contactors that have come to a mesh in a step began (collective).
+    """Initial positions of contactors that have come into contact with a mesh in a step (collective).
 
     Returns:
-        How far behind the facet that they touch, and, of those that began in front of both faces of an edge or nearer to another face,
-        how far from this facet; lengths ``(n,)``, zero for all others.
+        Initial distance behind the touched facet; and, for contactors that began in front of both faces of an edge or nearer to another
+        face, the initial distance from the touched facet. Lengths ``(n,)``, zero for all other contactors.
     """
     behind, unsure = np.zeros((2, len(pair.nodes)))
     new = np.flatnonzero(pair.trial.active & ~pair.committed.active)
@@ -238,10 +238,10 @@ def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array
         outward, away = target.outward(nearest), x - nearest.foot
         beside = np.linalg.norm(away - _dot(away, outward)[:, None] * outward, axis=1) > PASSAGE_DEPTH * target.stride
         beside &= ~(nearest.beyond != 0.0).any(axis=1)
-        # the mean of the normals about an edge leans from those of both faces
+        # the mean normal at an edge is inclined to the normals of both faces
         sharp = to_mean(SHARP_EDGE)
         normal = target.outward(touched)
-        # from a face that stands before the one that they touch, they come by a concave edge or across free space
+        # from a face in front of the touched face, contactors come along a concave edge or across free space
         turned = (_dot(normal, outward) < sharp) & (_dot(nearest.foot - touched.foot, normal) <= PASSAGE_DEPTH * target.stride)
         other = (beside & (_dot(nearest.averaged, outward) < sharp)) | turned
         way = np.linalg.norm(x - touched.foot, axis=1)
@@ -258,11 +258,11 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _through_surface(pair: Interface, way: Array, motion: Motion | None, longest: float, moving: bool) -> tuple[Array, Array]:
-    """Contactors that pass through a surface without facets, by its gaps at places a stride apart (collective).
+    """Contactors that pass through a surface without facets, from gaps at positions a stride apart (collective).
 
     Returns:
-        How deep those that pass are inside, and how far behind the place that they touch those have begun that have come to it in the
-        step; lengths ``(n,)``.
+        Depth of passing contactors; and, for contactors that have come into contact in the step, their initial distance behind the
+        touched point. Lengths ``(n,)``.
     """
     target, end, active = pair.target, pair.points, pair.trial.active
     places = np.ceil(longest / target.stride)
@@ -279,14 +279,14 @@ def _through_surface(pair: Interface, way: Array, motion: Motion | None, longest
     for k in range(int(places) + 1):
         part = k / places
         x = start + part * (end - start)
-        # where the target will be when the rest of its motion is done
+        # relative to the target at the end of the step
         if motion is not now:
             x = (now or still).since(motion or still, 1.0 - part).carry(x)
         p = target.project(x)
         if k == 0:
             new = active & ~pair.committed.active & (p.gap >= 0.0)
             behind[new] = np.einsum("ng,ng->n", end - x, pair.projection.normal)[new]
-        # at the end contactors may rest on a face to rounding
+        # at the end contactors may be on a face up to rounding
         outside = (p.gap >= (-PASSAGE_DEPTH * target.stride if k == places else 0.0)) | (k == 0) | ((k == places) & active)
         passed = outside & (deepest > PASSAGE_DEPTH * target.stride) & ~pair.tied
         passed &= (_dot(entry, p.normal) < LOOKING_AWAY) | (moving & ~active)

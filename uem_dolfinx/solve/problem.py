@@ -1,4 +1,4 @@
-"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, wired up and solved for one state after the other."""
+"""UnitedProblem: a UFL residual, Dirichlet conditions and contacts, combined and solved step by step."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ ACCURACY = given.between(0.0, 1.0)
 
 
 class UnitedProblem(given.Sealed):
-    """Bodies in contact by the United Elements Method, in statics, or in dynamics where there is inertia.
+    """Bodies in contact by the United Elements Method, in statics or dynamics.
 
     Solves ``F(u; v) = 0`` with the contactors of every contact united to their targets:
 
@@ -63,37 +63,37 @@ class UnitedProblem(given.Sealed):
         displacement: number of the displacement's part of the mixed space; other parts, such as a pressure or a temperature, are
             solved for as well, without contact conditions.
         bcs: Dirichlet conditions.
-        contacts: contacts between bodies or with rigid surfaces, or one of all with all; none is fine.
-        equations: linear equations between displacements of nodes: of ``Equation`` and ``periodic``.
-        couplings: parts that move rigidly with a point, or distribute its load: of ``RigidCoupling``.
-        points: forces and springs at nodes, as ``PointLoad`` and ``PointSpring``, which are no terms of F.
+        contacts: contacts between bodies or with rigid surfaces, or a general contact of all surfaces; may be empty.
+        equations: linear equations between displacements of nodes: ``Equation`` and ``periodic``.
+        couplings: parts that move rigidly with a point, or distribute its load: ``RigidCoupling``.
+        points: forces and springs at nodes in addition to F: ``PointLoad`` and ``PointSpring``.
         petsc_options_prefix: prefix of the linear solver's options.
-        petsc_options: its options without prefix; none choose MUMPS or CG with AMG by size. Unless they fix ``ksp_rtol``, an
-            iterative solve is as accurate as its Newton iteration can use.
+        petsc_options: its options without prefix; by default MUMPS or CG with AMG, depending on the size. Unless they fix
+            ``ksp_rtol``, the tolerance of iterative solves follows the Newton residual.
         load: a ``fem.Constant`` that is set to the load factor while the Dirichlet values are ramped. Or several,
             ``{constant: value}``, each with its value at the full load, to which it is ramped, or a function of the factor that
             returns it. Or one function of the factor that sets loads and Dirichlet values itself. None ramps the Dirichlet values
             only. In time steps the factor is replaced by the time.
         dynamics: mass, velocity and time integration; None is statics.
-        materials: all laws with history that F is made of, such as ``VonMises``.
+        materials: all laws with history in F, such as ``VonMises``.
         newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
         consistent_tangent: add the curvature of the contact to K, which makes Newton quadratic.
         line_search: shorten steps that invert cells or do not reduce the residual's work.
-        check_inversion: look for cells turned inside out in every iteration; None does so unless K is constant.
+        check_inversion: check for inverted cells in every iteration; None does so unless K is constant.
         rtol: bound on the norm of ``P'r`` relative to the forces at work.
         max_iterations: bound on the linear solves of one step.
-        method: how contact is reached, by default by elimination: called with the arguments of ``solve.system.BodySystem`` it makes a
-            ``solve.newton.ContactMethod``.
+        method: method to impose contact, by default elimination: called with the arguments of ``solve.united.system.BodySystem``,
+            it returns a ``solve.united.newton.ContactMethod``.
         verbose: print one line per iteration.
 
     Raises:
         InputError, InputTypeError: for an argument of another type or out of its range, with its name and value; on all ranks.
-        SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, F does not
-            depend on it, a Dirichlet condition, the test function or a law with history is of another one, F contains objects of
-            another mesh, or a contact belongs to another problem.
+        SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, if F does not
+            depend on it, if a Dirichlet condition, the test function or a law with history is of another space or displacement, if
+            F contains objects of another mesh, or if a contact belongs to another problem.
         MeshError: if the coordinates of a node are not finite, with the node.
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
-        KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM meanwhile.
+        KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM meanwhile.
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
 
@@ -165,22 +165,22 @@ class UnitedProblem(given.Sealed):
             newton=newton, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search,
             consistent_tangent=consistent_tangent, check_inversion=check_inversion,
         )  # fmt: skip
-        #: Contacts as they were declared, and all that they consist of: a general one is several.
+        #: Contacts as declared, and, below, their parts: a general contact consists of several.
         ties, contacts = ([], contacts) if self.config.moves else (contacts, [])
         self.declared: list[Contact | GeneralContact] = contacts
-        #: What else was declared: ties of a scalar field, linear equations, couplings, and loads and springs at points.
+        #: Other declared objects: ties of a scalar field, linear equations, couplings, and loads and springs at points.
         self.ties, self.equations, self.couplings, self.points = ties, equations, couplings, points
         self.contacts: list[Contact] = parts_of(contacts, self.config, couplings)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             checks.check_residual(damping, u, "the damping form")
-        # cells that conditions hold or a coupling makes rigid may have no stiffness, nor be in F
+        # cells held by conditions or made rigid by a coupling may have no stiffness, and may be missing in F
         F, at_points = revolved(F if self.config.unknowns.mixed else in_all_cells(F, u, bool(self.materials))), None
         if points or couplings:
             from uem_dolfinx.conditions.at_points import AtPoints
 
             at_points = AtPoints(self.config, points, couplings)
-        #: What the bodies do without contact.
+        #: The bodies without contact.
         self.bodies = Bodies(
             self.config,
             F if damping is None else F + damping,
@@ -209,43 +209,43 @@ class UnitedProblem(given.Sealed):
 
             dynamics.make_contactors_massless(self.contacts)
             warn_of_soft_targets(dynamics.mass, self.contacts, self.bodies.initial_stiffness)
-        #: Bodies and contact as the Newton loop sees them.
+        #: Options of the system of bodies and contacts that the Newton loop solves.
         options: dict[str, Any] = {"newton": newton, "consistent_tangent": consistent_tangent}
-        #: Equations of users; None without any.
+        #: Equations of users, or None.
         self.linear: UserRows | None = None
         scalar = [ScalarTie(self.config, tie, free) for tie in ties] if ties else []
         self._of_users = [*scalar, *equations], couplings, [tie.followed for tie in scalar]
         self.unite(self.load, clock.get("at", 0.0))
         options |= {} if self.linear is None else {"linear": self.linear}
-        #: The ``solve.stages.Stage`` that the problem is in; None outside of those.
+        #: The present ``solve.steps.stages.Stage``, or None.
         self.stage: Any = None
         self.system = method(self.bodies, self.interfaces, self.solver, **options)
-        #: Length of time steps, and what is known of those before.
+        #: Length of time steps, with the history needed to control it.
         self.step_control = StepControl()
-        #: How far the problem is, in steps and in load.
+        #: Progress in steps and in load.
         self.progress = Progress()
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
-        #: Where the rigid targets were then; None for those that had not moved, and for meshes.
+        #: Motions of the rigid targets in that state; None for targets that had not moved, and for meshes.
         self.motions = self.rigid_motions()
-        #: Norm of the largest forces of all steps, as far as they are told from rounding.
+        #: Norm of the largest forces of all steps, as far as they exceed rounding.
         self.largest_forces: Norm = 0.0
-        #: What the last step began with, where its ramp began, how far it went, and whether something led its load.
+        #: State at the beginning of the last step, and ``led``: the start of its ramp, its fraction, and whether its load was controlled.
         from uem_dolfinx.solve.memory import Memory
 
         self._before = Memory.of(self)
         self.led: tuple[np.ndarray | None, float, bool] = None, 1.0, False
-        #: Load factor or time that loads have been set to for the next step; None before that.
+        #: Load factor or time for which loads have been set for the next step; None if they have not been set.
         self.set_at: float | None = None
-        #: What keeps all steps for gradients; None for nothing.
+        #: Record of all steps for gradients, or None.
         self.history: Any = None
         for contact in self.contacts:
             contact.begin()
-        #: What is warned of while steps are taken.
+        #: Warnings issued during steps.
         self.watch = Watch(self.contacts, equations)
         from uem_dolfinx.solve.settings import Settings
 
-        #: What the run is made with, for checkpoints.
+        #: Settings of the run, for checkpoints.
         beside = {"equations": equations, "couplings": couplings, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in beside.items() if some}
         self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
@@ -253,7 +253,7 @@ class UnitedProblem(given.Sealed):
         checks.take_materials(self.materials)
 
     def __repr__(self) -> str:
-        """Its size, contacts, and how far it is."""
+        """Its size, contacts and progress."""
         config, dofmap = self.config, self.u.function_space.dofmap
         size = f"{dofmap.index_map_bs * dofmap.index_map.size_global} unknowns in {config.gdim}D"
         kind = "statics" if self.dynamics is None else f"dynamics at time {self.dynamics.time:.6g}"
@@ -263,7 +263,7 @@ class UnitedProblem(given.Sealed):
     # -- one step ----------------------------------------------------------------------------------------------------
 
     def unite(self, load: Any, at: float) -> None:
-        """Make rows of the equations of users under the present conditions, for a load and its factor or the time (collective)."""
+        """Make the rows of users' equations under the present conditions, for a load and its factor or the time (collective)."""
         equations, couplings, followed = self._of_users
         if equations or couplings:
             from uem_dolfinx.conditions.user_rows import rows_of_users
@@ -272,9 +272,9 @@ class UnitedProblem(given.Sealed):
             self.linear = rows_of_users(self.config, equations, couplings, free, nodes + followed, load, at)
 
     def set_load(self, at: float, known: bool = False) -> None:
-        """Set loads, what else ``load`` sets, and friction, of a load factor or a time; a UserFunctionError if one raises (collective).
+        """Set ``load``, contacts and equations to a load factor or a time; UserFunctionError if a function raises (collective).
 
-        ``known`` says whether the committed state has been reached with them; else the next step begins with them.
+        ``known``: whether the committed state has been reached with these loads; otherwise the next step begins with them.
         """
         self.set_at = None if known else at
         if self.stage is not None:
@@ -288,14 +288,14 @@ class UnitedProblem(given.Sealed):
     def solve(self, *, start: np.ndarray | None = None, fraction: float = 1.0) -> list[Iteration]:
         """Bring the bodies into equilibrium and commit the state (collective).
 
-        The load factor is 1, in dynamics the time the present one, for ``load`` and all functions of equations, couplings, preloads and
-        friction. In the body of a loop over ``load_steps`` or ``time_steps`` the step is taken once more from the state that it began with
-        and replaced, at its load factor or time, under loads, Dirichlet values and fields as they are now. Histories of friction and
-        plasticity, and velocities, are those of one step, however often it is taken.
+        The load factor is 1, or in dynamics the time is the present one, for ``load`` and all functions of equations, couplings, preloads
+        and friction. Within a loop over ``load_steps`` or ``time_steps`` the step is repeated from its initial state and its result
+        replaced, at the same load factor or time, under the present loads, Dirichlet values and fields. Histories of friction and
+        plasticity, and velocities, count one step, however often it is repeated.
 
-        Arguments, return value and errors are those of :meth:`attempt`, with loads of the factor ``fraction``; they stay as they
-        are with a ``start``, or if ``set_load`` has set them since the last step. If the repeated step fails, the previous result
-        is kept. KeyboardInterrupt and SystemExit are raised as ``load_steps`` does.
+        Arguments, return value and errors are as in :meth:`attempt`, with loads of the factor ``fraction``. Loads are unchanged with a
+        ``start``, or if ``set_load`` has set them since the last step. If the repeated step fails, the previous result is kept.
+        KeyboardInterrupt and SystemExit are raised as in ``load_steps``.
         """
         from uem_dolfinx.solve.memory import take_again, take_alone
 
@@ -310,9 +310,9 @@ class UnitedProblem(given.Sealed):
         """Bring the bodies into equilibrium, to be followed by ``commit`` or ``restore`` (collective).
 
         Args:
-            start: displacement array at which the ramp of the Dirichlet values begins; None is the committed one.
-            fraction: how far the Dirichlet values go, from ``start`` (0) to the values of ``bcs`` (1).
-            along: what leads the load from iteration to iteration, and its steps, which no line search shortens; None is nothing.
+            start: displacement array at which the ramp of the Dirichlet values begins; None is the committed displacement.
+            fraction: part of the ramp of the Dirichlet values, from ``start`` (0) to the values of ``bcs`` (1).
+            along: method that controls the load in every iteration, without line search, such as arc length; or None.
 
         Returns:
             The history of iterations.
@@ -362,7 +362,7 @@ class UnitedProblem(given.Sealed):
         return history
 
     def commit(self) -> None:
-        """Keep the present displacement and contact state."""
+        """Commit the present displacement and contact state."""
         from uem_dolfinx.solve.memory import Memory
 
         self._before, self.progress.taken = Memory.of(self), taken_by(self)
@@ -371,7 +371,7 @@ class UnitedProblem(given.Sealed):
         self.keep()
 
     def keep(self) -> None:
-        """Make the present state the committed one; what the step began with stays what it was (collective)."""
+        """Make the present state the committed one; the initial state of the step is unchanged (collective)."""
         if self.history is not None:
             self.history.note(self._before, self.led[2])
         self.committed = np.array(self.u.x.array)
@@ -400,21 +400,21 @@ class UnitedProblem(given.Sealed):
             pair.project()
 
     def state(self) -> State:
-        """Contents of a checkpoint of the problem; read back, the next step is the one that would have come (collective).
+        """Contents of a checkpoint of the problem, from which the run continues as if uninterrupted (collective).
 
-        Loads and Dirichlet values are the script's, which sets them before every step. Names of Functions and numbers that are
-        added must differ from those here.
+        Loads and Dirichlet values are not included: the script sets them before every step. Names of added Functions and numbers
+        must differ from the names in use.
         """
         from uem_dolfinx.solve.kept import state_of
 
         return state_of(self)
 
     def reaction(self, tag: Part) -> np.ndarray:
-        """Force with which the Dirichlet conditions act on the nodes of a part of the mesh: their sum ``(gdim,)`` (collective).
+        """Reaction force of the Dirichlet conditions on a part of the mesh, summed over its nodes ``(gdim,)`` (collective).
 
         Args:
-            tag: of any dimension, or facets as ``Contact`` takes them; components without Dirichlet condition count as zero. Of
-                axisymmetric bodies radial forces cancel around the axis.
+            tag: of any dimension, or facets as in ``Contact``; components without Dirichlet condition count as zero. In
+                axisymmetry radial forces cancel around the axis.
         """
         tdim = self.config.tdim
         nodes = surface_nodes(self.config, as_tag(tag, self.config.mesh, (tdim - 1, *range(tdim + 1)), "the support"))
@@ -424,24 +424,24 @@ class UnitedProblem(given.Sealed):
 
     @property
     def pairs(self) -> list[Interface]:
-        """Contactors and targets of the contacts."""
+        """The interface of every contact, with its contactors and target."""
         return [contact.pair for contact in self.contacts]
 
     @property
     def interfaces(self) -> list[Interface]:
-        """The same as they are treated, contacts that are alike together."""
+        """The interfaces in use, with similar contacts joined into one."""
         return list({id(pair.whole): pair.whole for pair in self.pairs}.values())
 
     def rigid_motions(self) -> list[Motion | None]:
-        """Where the rigid targets of all ``interfaces`` are now; None for those that have not moved, and for meshes."""
+        """Present motions of the rigid targets of all ``interfaces``; None for targets that have not moved, and for meshes."""
         return [pair.target.motion for pair in self.interfaces]
 
 
 def check_steps(problem: Any, checkpoint: Any) -> None:
-    """Refuse to step what is no problem, or with what is no checkpoint (collective where there is a problem).
+    """Refuse arguments of step functions that are no problem or no checkpoint (collective if there is a problem).
 
     Raises:
-        InputTypeError: naming it.
+        InputTypeError: for other objects.
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):

@@ -1,4 +1,4 @@
-"""Steps under way: what is switched between them, what that releases, and how loads and coefficients go from value to value."""
+"""Steps in progress: switched conditions and contacts, forces released by them, and ramps of loads and coefficients."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from uem_dolfinx.solve.united.system import BodySystem
 
 
 def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
-    """Refuse steps that are not of this problem, before the first is taken (collective).
+    """Refuse steps that do not fit this problem, before the first is taken (collective).
 
     Raises:
-        InputError, InputTypeError, SpaceError: naming the step, and what it cannot do.
+        InputError, InputTypeError, SpaceError: names the step and the unsupported change.
     """
     with agreed(problem.comm):
         given.items("steps", steps, lambda one: isinstance(one, Step), "a Step")
@@ -101,25 +101,25 @@ def _check(problem: UnitedProblem, step: Step, words: str) -> None:
 
 
 class Stage:
-    """A step that a problem has begun, or goes on with (making one is collective).
+    """A step that a problem begins or continues (the constructor is collective).
 
     Args:
-        problem: taken through it.
-        step: as it was declared, and checked.
-        end: load factor at which it ended, if the problem's state is one of a later call.
+        problem: the problem.
+        step: the declared and checked step.
+        end: load factor at the end of the step, if the problem's state belongs to a later call.
 
     Attributes:
-        step: likewise.
+        step: the declared step.
 
     Raises:
-        CheckpointError: if the problem's state is one of another step.
+        CheckpointError: if the problem's state belongs to another step.
         InputError: if conditions change at nodes that mortar ties.
     """
 
     def __init__(self, problem: UnitedProblem, step: Step, end: float = 1.0):
         self._problem, self.step = problem, step
         progress, self._at = problem.progress, 0.0
-        #: Whether nothing of it has been done yet, rather than a part of it, or all, before a checkpoint.
+        #: Whether the step begins now; otherwise it was begun or completed before a checkpoint.
         fresh = progress.ahead > 0
         if progress.ahead == 0 and progress.step != step.name:
             raise CheckpointError(
@@ -133,7 +133,7 @@ class Stage:
         known = not fresh
         for contact, value in step.friction.items():
             take_friction(contact, blended_friction(contact, value, self._share), known)
-        #: Offsets where the step began.
+        #: Offsets at the beginning of the step.
         self._offsets = {contact: contact.offset for contact in step.offset}
         problem.stage = self
         if fresh:
@@ -141,7 +141,7 @@ class Stage:
         else:
             at = progress.factor if progress.ahead == 0 else end
             problem.set_load(at, known=True)
-            # earlier steps have been gone through before
+            # shares of earlier steps are known already
             progress.take_shares(replace(progress.began, led=progress.taken.now().led), progress.taken)
             progress.take_shares(progress.began, progress.taken.with_led(self.led(at)))
             move_targets(problem, problem.motions)
@@ -149,16 +149,16 @@ class Stage:
                 settle(pair)
 
     def _share(self, at: float) -> float:
-        """Part of the way from where the step began that is done at a load factor."""
+        """Fraction of the step's ramps at a load factor."""
         return at if self.step.ramp else 1.0
 
-    # -- what is switched ------------------------------------------------------------------------------------------------
+    # -- switched conditions and contacts --------------------------------------------------------------------------------
 
     def _switch(self, fresh: bool) -> None:
-        """Take the step's conditions and contacts, and the forces of what it releases (collective)."""
+        """Apply the step's conditions and contacts, and keep the forces of released conditions and contacts (collective)."""
         problem, step = self._problem, self.step
         if step.contacts:
-            # some of those that are alike go on without the others
+            # similar contacts that were joined may be switched separately
             part_contacts(problem)
         bodies, held = problem.bodies, problem.bodies.held
         parts = [(part, on) for one, on in step.contacts.items() for part in ([one] if isinstance(one, Contact) else one.parts)]
@@ -187,14 +187,14 @@ class Stage:
             left_on = {id(contact.pair.whole) for contact in problem.contacts if contact.on}
             problem.system.take([pair for pair in problem.interfaces if id(pair) in left_on], problem.linear)
 
-    # -- what is released ------------------------------------------------------------------------------------------------
+    # -- released forces -------------------------------------------------------------------------------------------------
 
     def _carried(self, acting: Array | None, released: Bools, left: Sequence[Contact]) -> Array | None:
-        """Forces of what is released at all unknowns, ghosts included ``(n,)``, and what an interrupted step has left; None for none.
+        """Forces of released conditions and contacts ``(n,)``, ghosts included, plus the rest of an interrupted step; None if zero.
 
         Args:
-            acting: forces of the conditions ``(n,)``; None if there was no step yet, so that nothing carries anything.
-            released: unknowns that are no longer held ``(n,)``.
+            acting: forces of the conditions ``(n,)``; None before the first step, when all forces are zero.
+            released: mask of unknowns that are no longer held ``(n,)``.
             left: contacts that are switched off.
         """
         problem, config = self._problem, self._problem.config
@@ -206,10 +206,10 @@ class Stage:
                 total[at] += config.add_at_owners(*contact.pair.nodal_forces(contact.pair.committed))
         return total if reduced(problem.comm, bool(total.any()), op=MPI.LOR) else None
 
-    # -- what is ramped --------------------------------------------------------------------------------------------------
+    # -- ramps -----------------------------------------------------------------------------------------------------------
 
     def _take_loads(self, fresh: bool) -> list[Any]:
-        """Let loads and preloads be the step's; returns where they begin (collective)."""
+        """Set loads and preloads of the step; returns their initial values (collective)."""
         problem, loads, bolts = self._problem, self.step.loads, self.step.preload
         constants = dict(loads) if isinstance(loads, dict) else {}
         starts = problem.progress.loads
@@ -229,7 +229,7 @@ class Stage:
         return starts
 
     def led(self, at: float) -> Iterator[tuple[Any, float]]:
-        """Constants, and contacts for their offsets, that it leads to given values, and the share that a load factor has of these."""
+        """Constants, and contacts for their offsets, that the step ramps, with their shares at a load factor, see ``taken``."""
         share, loads, began = self._share(at), self.step.loads, self._problem.progress.began
         for constant, end in loads.items() if isinstance(loads, Mapping) else ():
             yield constant, 1.0 if callable(end) else share + (1.0 - share) * began.began(constant)
@@ -237,7 +237,7 @@ class Stage:
             yield contact, share + (1.0 - share) * began.began(contact)
 
     def take_load(self, at: float) -> None:
-        """Release what was carried, and take offsets, as far as a load factor tells (collective)."""
+        """Ramp down released forces, and ramp offsets, at a load factor (collective)."""
         problem, self._at = self._problem, at
         carried, left = problem.progress.carried, 1.0 - self._share(at)
         problem.bodies.dead = carried * left if carried is not None and left else None
@@ -246,7 +246,7 @@ class Stage:
             contact.offset = end if left == 0.0 else between(start, end, self._share(at))
 
     def leave(self) -> None:
-        """Let everything stay as it is at the load factor that has been reached."""
+        """End the step and keep its values at the load factor that has been reached."""
         problem = self._problem
         problem.load = problem.stage = None
         for contact, value in self.step.friction.items():

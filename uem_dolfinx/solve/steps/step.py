@@ -1,4 +1,4 @@
-"""A step of a problem as users declare it: what is on in it, and where loads and coefficients go."""
+"""A step of a problem as declared by users: active conditions and contacts, and end values of loads and coefficients."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from uem_dolfinx.solve.loading import check_load
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step:
-    """One of the steps that a problem is taken through, each from where the one before has ended: ``load_steps(problem, [fit, turn])``.
+    """A step in a sequence of steps, each of which starts at the end of the previous one: ``load_steps(problem, [fit, turn])``.
 
     A step lists only what changes relative to the previous step. Its load factor s runs from 0 to 1. Constants and coefficients are
-    ramped from their present values to the given ones, Dirichlet values from the present displacement to those of the conditions.
+    ramped from their present values to the given ones, Dirichlet values from the present displacement to the conditions' values.
     Removed conditions, and contacts that are switched off, are replaced by their forces, times 1 - s.
 
     Args:
         name: for messages and results.
-        n: nominal number of load steps, cut on failure as those of ``load_steps``.
-        bcs: all Dirichlet conditions of the step; None keeps those of the step before.
+        n: nominal number of load steps, cut on failure as in ``load_steps``.
+        bcs: all Dirichlet conditions of the step; None keeps the conditions of the previous step.
         loads: as ``load`` of a ``UnitedProblem``: ``{constant: value}``, each with its value at the end of the step, to which it is
             ramped from the present one, or a function of s; or one function of s that sets loads and Dirichlet values itself, which
-            then are not ramped.
-        contacts: contacts that are switched on (True) or off (False). One that is switched on begins as at the start of a problem,
-            where the bodies are by then.
-        friction: of contacts that were made with friction, as of ``Contact``, by the same law: its coefficient, or other parameter, is
-            ramped; a function of place and s is taken as it is.
-        offset: of contacts, as of ``Contact``: a length or a function of place, ramped.
+            are then not ramped.
+        contacts: contacts that are switched on (True) or off (False). A contact that is switched on starts as in a new problem, at
+            the present positions of the bodies.
+        friction: of contacts that were made with friction, as in ``Contact``, with the same law: its coefficient, or other parameter,
+            is ramped; a function of position and s is not ramped.
+        offset: of contacts, as in ``Contact``: a length or a function of position, ramped.
         preload: of ``Preload`` sections: the force at the end of the step, to which it is ramped from the present one, or a
             function of s; None locks the section at its present length.
-        begin: called when the step begins, before anything else, on all ranks, as ``contact.tie``. It is not called again after a
-            restart from a checkpoint of this step or a later one, which must contain its effect.
-        ramp: False lets all of this act in full from the first load step on.
+        begin: called at the beginning of the step, before anything else, on all ranks, e.g. ``contact.tie``. It is not called again
+            after a restart from a checkpoint of this step or a later one, which must contain its effect.
+        ramp: False applies all changes in full from the first load step on.
 
     Raises:
         InputError, InputTypeError: for an argument of another type or out of its range.
@@ -82,7 +82,7 @@ class Step:
         of_contacts("preload", "forces", Preload, lambda f: f if f is None or callable(f) else given.number(f"{of}preload", f))
 
     def __repr__(self) -> str:
-        """Its name, number of load steps, and what it names."""
+        """Its name, number of load steps, and the arguments that are set."""
         more = [what for what in ("bcs", "loads", "begin") if getattr(self, what) is not None]
         more += [what for what in ("contacts", "friction", "offset", "preload") if getattr(self, what)]
         return f"Step({self.name!r}, n={self.n}, of {', '.join(more) or 'nothing'})"
