@@ -1,4 +1,4 @@
-"""What can be read from a contact after a step: forces, pressures, gaps, as arrays, fields and sums; and how far from balance they are."""
+"""Results of a contact after a step: forces, pressures and gaps as arrays, fields and sums, and the imbalance of forces."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Resultant:
-    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D; of axisymmetric bodies the force along the axis.
+    """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D; for axisymmetric bodies the axial force.
 
-    ``normal`` is the sum of the forces across the target, positive where surfaces press: of bodies of
-    revolution those on whole circles, so that a press fit has pressure times ``2 pi r`` times length.
+    ``normal`` is the sum of the normal forces, positive in compression. In axisymmetry it is integrated over full circles: for a
+    press fit it is pressure times ``2 pi r`` times length.
     """
 
     force: Array
@@ -73,35 +73,35 @@ def imbalance(comm: MPI.Comm, x: Array, f: Array) -> Balance:
 
 
 def not_attached(name: str) -> SurfaceError:
-    """What to tell about a contact that is asked for what it has in a problem only."""
+    """The error for results of a contact that belongs to no problem yet."""
     return SurfaceError(f"contact '{name}' belongs to no problem yet: hand it to a UnitedProblem first")
 
 
 class OfProblem:
-    """What is of use in a problem only."""
+    """Base of objects whose results exist only in a problem."""
 
     name: str
     _attached: Configuration | None = None
 
     @property
     def _config(self) -> Configuration:
-        """Configuration of the problem's displacement; a SurfaceError if it is in none."""
+        """Configuration of the problem's displacement; SurfaceError without a problem."""
         if self._attached is None:
             raise not_attached(self.name)
         return self._attached
 
 
 class ContactResults:
-    """What can be read from a contact after a step.
+    """Results of a contact after a step.
 
     Attributes:
         name: for messages and files.
         contactor: facets whose nodes are the contactors, or points.
-        coupling: word for the discretisation, or a class of the user's.
-        measure: what pressures and tractions are forces per area of: ``"reference"`` or ``"current"``.
+        coupling: name of the discretisation, or a user-defined class.
+        measure: area for pressures and tractions: ``"reference"`` or ``"current"``.
         heats: conductances.
         config: configuration of the displacement, once the contact belongs to a problem.
-        taken: whether it does.
+        taken: whether it belongs to a problem.
     """
 
     name: str
@@ -133,7 +133,7 @@ class ContactResults:
 
     @property
     def initial_overlap(self) -> float:
-        """How deep contactors were inside the target before the first step, a length; 0 if none was."""
+        """Largest penetration of contactors before the first step, a length; 0 without penetration."""
         return self.pair.initial_overlap
 
     def max_gap(self) -> float:
@@ -151,31 +151,31 @@ class ContactResults:
         return self.surface.reference[self.pair.nodes]
 
     def measured_areas(self) -> Array:
-        """Areas that forces along and across the normal are divided by ``(n_contactors,)``, zero where there is none (collective)."""
+        """Areas for pressures and tractions at contactors ``(n_contactors,)``, zero where there is no area (collective)."""
         current = self.measure == "current"
         return self.pair.areas(self.areas_facing(self.nodes, self.pair.projection.normal, current), current, self._areas)
 
     def areas_facing(self, nodes: Indices, normal: Array | None, current: bool) -> Array:
-        """Integrals of the shape functions at contactors ``(n,)``, at sharp edges over what faces the target (collective).
+        """Integrals of the shape functions at contactors ``(n,)``, at sharp edges over facets that face the target (collective).
 
-        ``normal (n, gdim)`` are normals of the target. They are those over the whole surface with mortar, whose segments tell what faces
-        the target, and before any placement.
+        ``normal (n, gdim)`` are normals of the target. Integrals extend over the whole surface with mortar, whose segments account
+        for the covered part, and before any placement.
         """
         if self.coupling == "mortar" or normal is None:
             return (self.surface.current if current else self.surface.reference)[nodes]
         return self.surface.facing(nodes, normal, current)
 
     def pressing(self) -> tuple[Array, Array]:
-        """Forces across ``(n_contactors,)`` and along ``(n_contactors, gdim)`` the target that these are divided into (collective)."""
+        """Normal ``(n_contactors,)`` and tangential forces ``(n_contactors, gdim)`` that are divided by ``measured_areas`` (collective)."""
         return self.pair.pressing()
 
     def leads(self) -> Bools:
-        """Contactors through which heat passes where they touch: of two that follow each other one ``(n_contactors,)`` (collective)."""
+        """Contactors that conduct heat when they touch; only one of two that follow each other ``(n_contactors,)`` (collective)."""
         return np.ones(len(self.nodes), bool)
 
     @property
     def nodes(self) -> Indices:
-        """Nodes of this rank's contactors, its own alone, by which fields of the displacement's space are asked ``(n_contactors,)``."""
+        """Owned contactor nodes of this rank, block indices of the displacement's space ``(n_contactors,)``."""
         return self.pair.nodes
 
     @property
@@ -187,9 +187,9 @@ class ContactResults:
     def pressures(self) -> Array:
         """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
 
-        The normal force over the node's tributary area: with ``coupling="mortar"`` what the target covers of it, else at sharp edges
-        what faces the target. ``measure`` says whether of the reference or of the current surface. It is negative where tied surfaces
-        pull.
+        The normal force over the node's tributary area. With ``coupling="mortar"`` only the covered part of this area counts,
+        otherwise at sharp edges only facets that face the target. ``measure`` selects the reference or the current surface.
+        Pressure is negative where tied surfaces are in tension.
         """
         areas = self.measured_areas()
         return np.where(areas > 0, self.pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)
@@ -206,8 +206,8 @@ class ContactResults:
     def pressure_to_integrate(self) -> fem.Function:
         """Normal forces per reference area as a scalar field whose integral over the contactor is their sum (collective).
 
-        It differs from :attr:`pressure` at degree 2, and with mortar where the contactor overhangs the target. Where the contactor has
-        facets on both sides of a sharp edge its integral over those that face the target is this sum. It is zero of points.
+        It differs from :attr:`pressure` at degree 2, and with mortar where the contactor overhangs the target. At sharp edges of
+        the contactor, integrate over the facets that face the target. It is zero for contactors given as points.
         """
         from uem_dolfinx.contact.mortar.densities import density
         from uem_dolfinx.contact.mortar.duals import basis_of
@@ -233,9 +233,9 @@ class ContactResults:
 
     @property
     def status(self) -> fem.Function:
-        """0 at open contactors, 1 where they stick or are tied, 2 where they slip, as all do without friction (collective).
+        """0 at open contactors, 1 if they stick or are tied, 2 if they slip; without friction all closed ones slip (collective).
 
-        With friction a contactor that a corner of the target holds in the plane sticks.
+        With friction, a contactor held in a 2D corner of the target sticks.
         """
         state = self.pair.trial
         sticks = (
@@ -247,13 +247,13 @@ class ContactResults:
 
     @property
     def traction(self) -> fem.Function:
-        """Force of friction, or of a tie, along the target per area that ``pressure`` is measured on, a vector field (collective)."""
+        """Tangential force of friction or of a tie, per area as for ``pressure``, as a vector field (collective)."""
         tau, areas = self.pressing()[1], self.measured_areas()[:, None]
         return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
 
     @property
     def slip(self) -> fem.Function:
-        """How far contactors have slipped over the target, summed over all committed steps, as a vector field on the contactor.
+        """Accumulated slip over all committed steps, as a vector field on the contactor, a length.
 
         It is zero without friction (collective).
         """
@@ -262,66 +262,66 @@ class ContactResults:
 
     @property
     def dissipation(self) -> float:
-        """Energy that friction has taken from the bodies in all committed steps: slips times means of a step's friction (collective)."""
+        """Frictional dissipation in all committed steps: slip times the mean friction of each step (collective)."""
         friction = self.pair.committed.friction
         return float(reduced(self.config.comm, 0.0 if friction is None else float(friction.work.sum())))
 
     @property
     def wear(self) -> fem.Function:
-        """Depth that has been worn off the contactor in all committed steps, as a scalar field, a length (collective)."""
+        """Wear depth of the contactor after all committed steps, as a scalar field, a length (collective)."""
         friction = self.pair.committed.friction
         return self._field("wear", 0.0 if friction is None else friction.worn)
 
     @property
     def worn_volume(self) -> float:
-        """Volume that has been worn off the contactor in all committed steps, the integral of ``wear`` as drawn (collective)."""
+        """Worn volume of the contactor after all committed steps: integral of ``wear`` over the reference surface (collective)."""
         wear = None if self.pair.friction is None else self.pair.friction.wear
         return 0.0 if wear is None else wear.volume(self.pair.committed)
 
     @property
     def heat_flux(self) -> fem.Function:
-        """Power per area that goes from the contactor to the target, as a scalar field on the contactor; 0 without ``heat`` (collective).
+        """Power per area from the contactor to the target, as a scalar field on the contactor; 0 without ``heat`` (collective).
 
-        The heat that friction makes where surfaces meet is not in it. Of several conductances it is that of the first one's field.
+        Frictional heat is not included. With several conductances, it belongs to the field of the first one.
         """
         return self.flux_of_part(self.pair.heats[0].law.field) if self.pair.heats else self._field("heat_flux", 0.0)
 
     def heat_flux_of(self, field: int) -> fem.Function:
-        """The same of a field, by all of its conductances together, as of an electric current (collective).
+        """Flux of a field, such as an electric current, summed over all of its conductances (collective).
 
         Args:
             field: number of the part of the mixed space.
 
         Raises:
-            InputError: if no conductance is of that field.
+            InputError: if no conductance belongs to that field.
         """
         return self.flux_of_part(one_of_fields(self.name, self.heats, field))
 
     def heat_power_of(self, field: int) -> float:
-        """Power that goes from the contactor to the target of a field, as of :meth:`heat_flux_of` (collective)."""
+        """Power from the contactor to the target in a field, see :meth:`heat_flux_of` (collective)."""
         field = one_of_fields(self.name, self.heats, field)
         power = sum(float(heat.power().sum()) for heat in self.pair.heats if heat.law.field == field)
         return float(reduced(self.config.comm, power))
 
     def flux_of_part(self, field: int) -> fem.Function:
-        """Flux of a field, zero where none passes (collective)."""
+        """Flux of a field, zero for fields without conductance (collective)."""
         fluxes = [heat.flux() for heat in self.pair.heats if heat.law.field == field]
         first = not self.pair.heats or self.pair.heats[0].law.field == field
         return self._field("heat_flux" if first else f"heat_flux_of_field_{field}", sum(fluxes, np.zeros(len(self.nodes))))
 
     @property
     def heat_power(self) -> float:
-        """Power that goes from the contactor to the target, the heat of friction aside; 0 without ``heat`` (collective)."""
+        """Power from the contactor to the target, without frictional heat; 0 without ``heat`` (collective)."""
         return self.heat_power_of(self.pair.heats[0].law.field) if self.pair.heats else 0.0
 
     def opposite(self, f: fem.Function) -> fem.Function:
-        """A field of the target at the contactors: what each faces there, as a scalar field on the contactor (collective).
+        """Values of a field on the target opposite to the contactors, as a scalar field on the contactor (collective).
 
-        Nodes of ``coupling="node_to_surface"`` face the point of the target below them, those of ``"mortar"`` a mean over the facets
-        around them.
+        With ``coupling="node_to_surface"``, values are taken at the closest points of the nodes, with ``"mortar"`` as means over
+        the facets around them.
 
         Args:
-            f: scalar Function on the mesh, as a temperature.
+            f: scalar Function on the mesh, such as a temperature.
 
         Raises:
             InputError, InputTypeError: for another Function, or a rigid target.
@@ -338,9 +338,9 @@ class ContactResults:
         return self._field("opposite", at.means(at.theirs, values.x.array[: self.config.n_owned]))
 
     def heat_balance(self) -> float:
-        """Heat that passes through the contact, summed over both bodies, over the sum of its nodal sizes (collective).
+        """Sum of nodal heat of both bodies over the sum of its absolute values; zero is conservation (collective).
 
-        Of several conductances the largest.
+        With several conductances, the largest value.
         """
         passing = [heat.nodal()[0] for heat in self.pair.heats]
         sums = reduced(self.config.comm, np.array([[part.sum(), np.abs(part).sum()] for part in passing]).reshape(-1, 2))
@@ -360,14 +360,14 @@ class ContactResults:
     def resultant(self, about: npt.ArrayLike | None = None, *, on: str = "contactor") -> Resultant:
         """Force and moment that the contact exerts on one of the bodies (collective).
 
-        Of axisymmetric bodies it is that on the whole body, which lies on the axis: radial forces cancel around it, and ``normal`` adds
-        up the forces across the target on whole circles.
+        In axisymmetry it is the resultant on the whole body: radial forces cancel, and ``normal`` is the sum of the normal forces
+        over full circles.
 
         Args:
-            about: point that the moment is taken about ``(gdim,)``. None is the origin, but for the force on a rigid surface
-                the surface's reference point where it is now: a tool's moment is about the point it turns about.
-            on: ``"contactor"``, or ``"target"``: a meshed one receives its forces at the feet of the contactors, a rigid one,
-                which has no nodes, where the contactors are.
+            about: point that the moment is taken about ``(gdim,)``. None is the origin; for the force on a rigid surface it is the
+                current reference point of the surface, about which a tool rotates.
+            on: ``"contactor"`` or ``"target"``. Forces on a meshed target act at the closest points of the contactors, forces on a
+                rigid target at the contactors.
 
         Raises:
             InputError, InputTypeError: for an unknown body, or a point that is not finite.
@@ -377,17 +377,17 @@ class ContactResults:
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
         x, f = self.pair.points, self.pair.trial.force
         if on == "target":
-            # a gap that a tie keeps is part of the target
+            # a gap kept by a tie moves with the target
             x, f = np.where(self.pair.tied[:, None], x, p.foot), -f
             centre = target.reference(g) if about is None else centre
         normal = float(reduced(self.config.comm, float(self.pair.pressing()[0].sum())))
         return replace(sum_up(self.config.comm, self.config.of_circles(x) - centre, self.config.of_circles(f)), normal=normal)
 
     def balance(self) -> Balance | None:
-        """Force and moment of the pair summed over both bodies; zero is action = reaction (collective).
+        """Imbalance of force and moment, summed over both bodies; zero is action = reaction (collective).
 
-        The contactors' forces come from the residual, the target's from handing them on to its nodes. Of axisymmetric bodies the forces
-        along the axis count.
+        Contactor forces come from the residual, target forces from their distribution to the target's nodes. In axisymmetry only
+        axial forces count.
 
         Returns:
             Imbalances relative to the sums of absolute nodal forces and moments; None for a rigid target, which has no nodes.
@@ -412,5 +412,5 @@ class ContactResults:
 
 
 def _identifier(text: str) -> str:
-    """Name of a Function that the form compiler can use in code."""
+    """Name of a Function as an identifier for the form compiler."""
     return re.sub(r"\W+", "_", text)

@@ -1,4 +1,4 @@
-"""Cells that a file or a model has, before a mesh is made of them: those that enclose nothing, or are there twice, are errors by name."""
+"""Checks of the cells of a file or model before a mesh is created: degenerate and duplicate cells are errors."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ VOLUMES_AT_ONCE = 20_000
 
 
 def check_nodes(cell: str, cells: Ints, points: Array, label: str, numbers: Ints | None = None) -> None:
-    """Refuse cells whose nodes make none.
+    """Refuse cells with invalid nodes.
 
     Args:
         cell: name of the cell, e.g. ``"triangle"``.
         cells: nodes of each cell ``(n, m)``, vertices first, rows of ``points``.
-        points: places of nodes ``(n_nodes, 2 or 3)``.
+        points: positions of nodes ``(n_nodes, 2 or 3)``.
         label: of the file or the model, for messages.
-        numbers: of the cells in the file ``(n,)``; None where messages count them.
+        numbers: of the cells in the file ``(n,)``; None: messages count the cells.
 
     Raises:
-        MeshError: for a cell that has a node twice, a node that is nowhere, all vertices of another cell, or the vertex of another cell
-            between its own vertices.
+        MeshError: for a cell with a repeated node, a node without finite coordinates, all vertices of another cell, or the vertex
+            of another cell between its own vertices.
     """
     ordered, n_vertices = np.sort(cells, axis=1), len(forms.reference_topology(cell)[0])
     _refuse("a node twice", ordered[:, 1:], np.equal(ordered[:, 1:], ordered[:, :-1]), points, label, numbers)
@@ -46,12 +46,12 @@ def check_nodes(cell: str, cells: Ints, points: Array, label: str, numbers: Ints
 
 
 def check_edges(cell: str, cells: Ints, points: Array, label: str, numbers: Ints | None = None) -> None:
-    """Refuse edges of cells of degree 2 that have two nodes in the middle, or the one of another edge.
+    """Refuse edges of cells of degree 2 with two different middle nodes, or with the middle node of another edge.
 
     Args:
-        cell: as of ``check_nodes``, and so are all others.
+        cell: see ``check_nodes``, also for the other arguments.
         cells: nodes of each cell in DOLFINx's order ``(n, m)``.
-        points: places.
+        points: positions of nodes.
         label: of the file.
         numbers: of the cells.
 
@@ -80,15 +80,15 @@ def check_volumes(cell: str, degree: int, cells: Ints, points: Array, label: str
     """Refuse flat cells.
 
     Args:
-        cell: as of ``check_nodes``.
+        cell: see ``check_nodes``.
         degree: of the geometry.
         cells: nodes of each cell in DOLFINx's order ``(n, m)``.
-        points: as of ``check_nodes``.
+        points: see ``check_nodes``.
         label: likewise.
         numbers: likewise.
 
     Raises:
-        MeshError: for a cell whose volume vanishes by its size.
+        MeshError: for a cell whose volume is zero relative to its size.
     """
     flat: Bools = np.zeros(cells.shape, dtype=bool)
     flat[:, 0] = flat_cells(cell, degree, cells, points)
@@ -97,7 +97,7 @@ def check_volumes(cell: str, degree: int, cells: Ints, points: Array, label: str
 
 
 def _refuse(what: str, nodes: Ints, bad: Bools, points: Array, label: str, numbers: Ints | None) -> None:
-    """Raise the error for the cells of which any of the ``nodes (n, k)`` is ``bad (n, k)``, if there are any."""
+    """Raise MeshError if any of the ``nodes (n, k)`` of cells is ``bad (n, k)``."""
     if not bad.any():
         return
     rows = np.asarray(bad.any(axis=1), dtype=bool)
@@ -112,8 +112,8 @@ def _refuse(what: str, nodes: Ints, bad: Bools, points: Array, label: str, numbe
 def flat_cells(cell: str, degree: int, cells: Ints, points: Array) -> Bools:
     """Which cells have no volume, with the arguments of ``check_volumes`` ``(n,)``.
 
-    The thickness of a cell is its volume over the product of its extents ``s_1 >= s_2 (>= s_3)`` but for the smallest, with ``s_i``
-    the root mean square of what its nodes are off their mean along principal axes; slender cells are not thin by their length.
+    The thickness of a cell is its volume over the product of its extents ``s_1 >= s_2 (>= s_3)`` except the smallest. ``s_i`` is
+    the rms distance of its nodes from their mean along a principal axis, so that slender cells do not count as thin.
     """
     dim = len(forms.reference_topology(cell)) - 1
     flat: Bools = np.zeros(len(cells), dtype=bool)
@@ -121,7 +121,7 @@ def flat_cells(cell: str, degree: int, cells: Ints, points: Array) -> Bools:
     for first in range(0, len(cells), VOLUMES_AT_ONCE):
         x = points[cells[first : first + VOLUMES_AT_ONCE], :dim]
         volume = np.abs(_volumes(x, tables, weights))
-        # extents are less than the size of the whole, so that few cells are left whose own are needed
+        # extents do not exceed the size of the cell, so that they are needed for few cells only
         few = np.flatnonzero(volume <= FLAT_CELL * np.linalg.norm(np.ptp(x, axis=1), axis=1) ** dim)
         if len(few):
             own = x[few] - x[few].mean(axis=1, keepdims=True)
@@ -131,14 +131,14 @@ def flat_cells(cell: str, degree: int, cells: Ints, points: Array) -> Bools:
 
 
 def _map(cell: str, degree: int, dim: int) -> tuple[Array, Array]:
-    """Derivatives of the shape functions at the points of a rule that is exact for volumes ``(dim, n_points, m)``, and its weights."""
+    """Derivatives of the shape functions at the points of a quadrature rule exact for volumes ``(dim, n_points, m)``, and its weights."""
     products = cell in ("quadrilateral", "hexahedron")
     points, weights = forms.quadrature_rule(cell, dim * degree - 1 if products else dim * (degree - 1))
     return np.ascontiguousarray(forms.create_lagrange_element(cell, degree).tabulate(1, points)[1:, :, :, 0]), weights
 
 
 def _volumes(x: Array, tables: Array, weights: Array) -> Array:
-    """Integrals of the determinant of the map of cells with nodes ``x (n, m, dim)``, negative for those inside out ``(n,)``."""
+    """Integrals of the Jacobian determinant of cells with nodes ``x (n, m, dim)``, negative for inverted cells ``(n,)``."""
     J = np.einsum("dqm,nmg->dnqg", tables, x, optimize=True)
     if len(J) == 2:
         det = J[0, ..., 0] * J[1, ..., 1] - J[0, ..., 1] * J[1, ..., 0]

@@ -1,4 +1,4 @@
-"""Facets of a surface in the current configuration, oriented outwards, each rank its own."""
+"""Facets of a surface in the current configuration, oriented outwards, distributed over the ranks."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": 
 
 @dataclass(frozen=True)
 class FacetData:
-    """Target facets of one rank now.
+    """Target facets of one rank in the current configuration.
 
     Attributes:
-        x: positions of their nodes ``(m, nn, gdim)``.
-        nodes: global block numbers of these ``(m, nn)``.
+        x: current positions of their nodes ``(m, nn, gdim)``.
+        nodes: global block numbers of the nodes ``(m, nn)``.
         nodal_normals: averaged outward unit normals there ``(m, nn, gdim)``.
-        corner_normals: sums of the outward unit normals of the facets around each corner, each times the angle that the facet has
-            there ``(m, n_corners, gdim)``. Of a point whose closest point is the corner they tell whether it is outside (Baerentzen
-            and Aanaes, 2005, doi:10.1109/TVCG.2005.49). None where they were not asked for.
+        corner_normals: sums of the outward unit normals of the facets around each corner, weighted with the angle of the facet
+            there ``(m, n_corners, gdim)``. If the closest point is a corner, they decide whether the point is outside (Baerentzen
+            and Aanaes, 2005, doi:10.1109/TVCG.2005.49). None if they have not been computed.
     """
 
     x: Array
@@ -43,7 +43,7 @@ class FacetData:
 
 
 class TargetFacets:
-    """Facets of a surface that this rank holds, oriented outwards (collective).
+    """Facets of a surface on this rank, oriented outwards (collective).
 
     Args:
         config: configuration of the displacement.
@@ -51,10 +51,10 @@ class TargetFacets:
         role: of the surface, for messages.
 
     Raises:
-        OrientationError: if a facet lies between two cells, so that outward has no meaning.
+        OrientationError: if a facet lies between two cells, so that the outward direction is undefined.
     """
 
-    #: The facets where they were when they were asked for last; None before.
+    #: The facets at their last positions; None before the first call of ``current``.
     _placed: FacetData | None = None
 
     def __init__(self, config: Configuration, tag: Tag, role: str = "target"):
@@ -72,7 +72,7 @@ class TargetFacets:
 
     @cached_property
     def keys(self) -> Ints:
-        """What tells each facet from all others in any partition, its cell in the mesh's input and its side of it ``(m,)``."""
+        """Key of each facet, independent of the partition: from its cell in the mesh's input and its side of the cell ``(m,)``."""
         n_sides = len(forms.reference_topology(compat.cell_name(self.config.mesh))[self.config.tdim - 1])
         return forms.original_cells(self.config.mesh)[self.cells] * n_sides + self.sides
 
@@ -94,17 +94,17 @@ class TargetFacets:
         return found
 
     def _orient(self, cell_dofs: Indices) -> None:
-        """Sign that turns the parametrisation's normal outwards, away from the cell's middle."""
+        """Find the sign that makes the parametrisation's normal point outwards, away from the cell's middle."""
         X, x = self.config.X, self.config.X[self.dofs]
         tab = self.shape.at_middle(len(x))
         inward = X[cell_dofs[self.cells]] - np.einsum("na,nag->ng", tab.N, x)[:, None]
         height = np.einsum("ng,nkg->nk", unit_normals(tab, x), inward)
         self.sign = np.where(height.mean(axis=1) > 0, -1.0, 1.0)
-        #: How deep the cell behind each facet is, a length ``(m,)``.
+        #: Depth of the cell behind each facet, a length ``(m,)``.
         self.depth: Array = np.abs(height).max(axis=1)
 
     def _refuse_inner(self) -> None:
-        """Raise on facets that lie between two cells, wherever those cells live."""
+        """Raise on facets that lie between two cells, on any rank."""
         corners = len(self.shape.topology[0])
         inner = np.flatnonzero(count_keys(self.config.comm, np.sort(self.nodes[:, :corners], axis=1)) > 1)
         error = None
@@ -117,21 +117,21 @@ class TargetFacets:
         agree(self.config.comm, error)
 
     def side_keys(self) -> Ints:
-        """What tells each side of each facet, alike on both facets that share it ``(m n_sides, k)``."""
+        """Key of each side of each facet, equal on both facets that share it ``(m n_sides, k)``."""
         corners = 1 if self.shape.dim == 1 else 2
         sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
         return np.stack(sides, axis=1).reshape(-1, corners)
 
     def _open_sides(self) -> npt.NDArray[np.bool_]:
-        """Which sides of each facet bound the surface ``(m, n_sides)``: they belong to one target facet only."""
+        """Sides of each facet that bound the surface ``(m, n_sides)``: they belong to one target facet only."""
         return (count_keys(self.config.comm, self.side_keys()) == 1).reshape(len(self.nodes), len(self.shape.edges()))
 
     def _open_nodes(self) -> npt.NDArray[np.bool_]:
-        """Which nodes of each facet lie on a side that bounds the surface, also of another facet ``(m, nn)`` (collective)."""
+        """Nodes of each facet on a side, of any facet, that bounds the surface ``(m, nn)`` (collective)."""
         return self.on_sides(self.open_sides)[self.dofs]
 
     def on_sides(self, which: Bools) -> Bools:
-        """Local nodes on some of the facets' sides, of any rank ``(n_local,)``; ``which (m, n_sides)`` are those (collective)."""
+        """Local nodes on the sides ``which (m, n_sides)`` of facets of any rank ``(n_local,)`` (collective)."""
         sides = enumerate(self.shape.edges())
         dofs = np.concatenate([self.dofs[which[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
         return self.config.to_owners(dofs, np.ones(len(dofs))) > 0
@@ -142,26 +142,26 @@ class TargetFacets:
 
     @property
     def x(self) -> Array:
-        """Nodes of the facets where they are now ``(m, nn, gdim)``."""
+        """Current positions of the facets' nodes ``(m, nn, gdim)``."""
         return self.config.X[self.dofs] + self.config.displacement[self.dofs]
 
     def normals(self, drawn: bool = False) -> Array:
-        """Outward unit normals of the facets at their nodes, each its own, now or as they were ``drawn``: ``(m, nn, gdim)``."""
+        """Outward unit normals of each facet at its nodes, current or, if ``drawn``, in the reference configuration ``(m, nn, gdim)``."""
         return unit(self._area_vectors(self.config.X[self.dofs] if drawn else self.x))
 
     def middles(self, x: Array) -> tuple[Array, Array]:
-        """Middles and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
+        """Midpoints and outward unit normals there of the facets with nodes at ``x (m, nn, gdim)``, ``(m, gdim)`` each."""
         tab = self.shape.at_middle(len(x))
         return np.einsum("na,nag->ng", tab.N, x), unit_normals(tab, x) * self.sign[:, None]
 
     def _area_vectors(self, x: Array) -> Array:
-        """Outward normals at the nodes ``(m, nn, gdim)`` of facets ``x (m, nn, gdim)``, as long as the facets are large."""
+        """Outward area vectors at the nodes ``(m, nn, gdim)`` of facets ``x (m, nn, gdim)``; their length is the facet's area."""
         return self.sign[:, None, None] * nodal_area_vectors(self.shape, x)
 
     def current(self, corners: bool = False) -> FacetData:
-        """Facets where they are now, with normals at corners if they are asked for (collective).
+        """Facets in the current configuration, with ``corner_normals`` if ``corners`` is True (collective).
 
-        What was made where no node has moved since is kept: it is asked for several times in each placement.
+        The result is kept while no node moves, since each placement calls this several times.
         """
         x = self.x
         if self._placed is None or reduced(self.config.comm, not np.array_equal(x, self._placed.x), op=MPI.LOR):
@@ -173,11 +173,11 @@ class TargetFacets:
         return self._placed
 
     def _placed_at(self, x: Array) -> FacetData:
-        """Facets with nodes at ``x (m, nn, gdim)``; every node sees its facet under the angle-free area weight (collective)."""
+        """Facets with nodes at ``x (m, nn, gdim)``; nodal normals are averages weighted with areas, without angles (collective)."""
         return FacetData(x, self.nodes, unit(self._summed(self._area_vectors(x))))
 
     def _summed(self, vectors: Array) -> Array:
-        """Sums over all facets of ``vectors (m, k, gdim)`` at the facets' first k nodes, seen from each of them (collective)."""
+        """Nodal sums over all facets of ``vectors (m, k, gdim)`` at the facets' first k nodes, returned for each facet (collective)."""
         field, dofs = self._normal_field, self.dofs[:, : vectors.shape[1]].astype(np.int64)
         nodal = field.x.array.reshape(-1, self.config.gdim)
         nodal[:] = sums_of_rows(dofs.ravel(), vectors.reshape(-1, self.config.gdim), len(nodal))
@@ -185,12 +185,12 @@ class TargetFacets:
         return np.asarray(nodal[dofs])
 
     def spread(self) -> Array:
-        """Areas of the facets around each node, over the length of their sum as vectors: 1 where all is flat ``(m, nn)`` (collective)."""
+        """Sum of the areas around each node over the length of the sum of area vectors: 1 if flat ``(m, nn)`` (collective)."""
         parts = self._areas_beside().reshape(-1, self.config.gdim + 1)
         return spread_of(np.column_stack([self.config.to_owners(self.dofs.ravel(), part) for part in parts.T])[self.dofs])
 
     def _areas_beside(self) -> Array:
-        """Outward normals at the nodes, as long as the facets are large, and beside them their lengths ``(m, nn, gdim + 1)``."""
+        """Outward area vectors at the nodes, and in the last column their lengths ``(m, nn, gdim + 1)``."""
         vectors = self._area_vectors(self.x)
         return np.concatenate([vectors, np.linalg.norm(vectors, axis=2, keepdims=True)], axis=2)
 
@@ -199,9 +199,9 @@ class FacetNodes(NamedTuple):
     """Nodes of the facets of a surface behind which this rank owns the cell.
 
     Attributes:
-        own: which sides of facets, in the order of these, are of cells that this rank owns ``(n,)``.
-        cells: behind them ``(m,)``.
-        sides: which of the cell's facets each is ``(m,)``.
+        own: whether the cell at each side of each facet is owned by this rank, in the order of sides ``(n,)``.
+        cells: cells behind the facets ``(m,)``.
+        sides: local number of each facet in its cell ``(m,)``.
         dofs: local nodes, in the numbering of the facet's own element ``(m, nn)``.
     """
 
@@ -212,7 +212,7 @@ class FacetNodes(NamedTuple):
 
 
 def nodes_of_facets(config: Configuration, tag: Tag) -> FacetNodes:
-    """Nodes of the facets of a surface, of those cells that this rank owns."""
+    """Nodes of the facets of a surface whose cells this rank owns."""
     cells, sides = forms.cells_of_facets(config.mesh, tag.entities)
     own = cells < config.mesh.topology.index_map(config.tdim).size_local
     cells, sides = cells[own], sides[own]
@@ -225,8 +225,8 @@ def _shape_of(config: Configuration) -> FacetShape:
 
 
 def facets_of(config: Configuration, tag: Tag, role: str = "target") -> TargetFacets:
-    """Facets of a surface, which all that name it share; arguments as of ``TargetFacets`` (collective)."""
-    # facets keep their tag, so that no other gets its number meanwhile
+    """Facets of a surface, shared by all users of the tag; arguments as for ``TargetFacets`` (collective)."""
+    # facets keep a reference to their tag, so that its ``id`` remains unique
     found: TargetFacets | None = config.surfaces.get(id(tag))
     if found is None:
         config.surfaces[id(tag)] = found = TargetFacets(config, tag, role)
@@ -234,19 +234,19 @@ def facets_of(config: Configuration, tag: Tag, role: str = "target") -> TargetFa
 
 
 def heights(points: Array, facet: Ints, planes: tuple[Array, Array]) -> Array:
-    """How high ``points (k, gdim)`` are over some of the ``planes`` through facets, as of ``TargetFacets.middles`` ``(k,)``."""
+    """Height of ``points (k, gdim)`` over the planes of facets, ``planes`` from ``TargetFacets.middles`` ``(k,)``."""
     middle, normal = planes
     return np.asarray(np.einsum("kg,kg->k", points - middle[facet], normal[facet]))
 
 
 def spread_of(sums: Array) -> Array:
-    """Sums of lengths over lengths of sums, from sums of vectors with lengths beside them ``(..., gdim + 1)``; 1 where there is none."""
+    """Sums of lengths over lengths of vector sums, from sums of vectors and of lengths ``(..., gdim + 1)``; 1 for zero vectors."""
     length = np.linalg.norm(sums[..., :-1], axis=-1)
     return np.asarray(np.where(length > 0, sums[..., -1] / np.where(length > 0, length, 1.0), 1.0))
 
 
 def unit(vectors: Array) -> Array:
-    """The vectors ``(..., gdim)`` with length one; those without length stay."""
+    """Normalise the vectors ``(..., gdim)``; zero vectors remain zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.where(length > 0, length, 1.0))
 

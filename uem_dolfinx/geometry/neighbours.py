@@ -1,8 +1,8 @@
-"""Which facets of which bodies each surface node may touch: lists that are made anew only when something has moved far enough.
+"""Lists of the facets that each surface node may touch, rebuilt only after a body has moved far enough.
 
-A facet may hold a node if it belongs to a body that the node's own follows, if it faces the node, and if the node was in front of it in
-the last state that was kept. Nodes at sharp edges follow in both directions: between the nodes of a surface they would else pass into it.
-All that is not listed costs nothing.
+A facet may hold a node if its body comes after the node's own in the order, if it faces the node, and if the node was in front of
+it in the last accepted state. Nodes at sharp edges follow in both directions, since they could otherwise penetrate between the
+nodes of the other surface. Facets that are not listed cost nothing.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ _orders = count()
 
 @dataclass(frozen=True)
 class Listing:
-    """Pairs of nodes and facets, each on the facet's rank.
+    """Pairs of nodes and facets, each stored on the rank of the facet.
 
     Attributes:
-        exchange: with the ranks that have facets for this rank's nodes; its rows are places of nodes.
-        node: places among the nodes received ``(k,)``.
-        facet: of this rank ``(k,)``.
-        cosine: between the facet's normal and that around the node which it faces most squarely, when it was listed ``(k,)``.
-        opened: sides of these behind which nothing is listed for the node ``(k, n_sides)``.
-        empty: whether there is none on any rank.
+        exchange: with the ranks that have facets for this rank's nodes; its rows are indices of nodes.
+        node: index among the nodes received ``(k,)``.
+        facet: number on this rank ``(k,)``.
+        cosine: least cosine between the facet's normal and the normals around the node, when it was listed ``(k,)``.
+        opened: sides of these facets beyond which no facet is listed for the node ``(k, n_sides)``.
+        empty: whether no rank has a pair.
     """
 
     exchange: Exchange
@@ -69,14 +69,14 @@ class Listing:
 
 
 class Asking(NamedTuple):
-    """What facets' ranks have to know of nodes.
+    """Data of nodes that the ranks of facets need.
 
     Attributes:
-        points: where they are ``(n, gdim)``.
-        committed: where they were when a step was last kept ``(n, gdim)``.
-        drawn: in the reference configuration ``(n, gdim)``.
-        reach: how far ahead of them is looked ``(n,)``.
-        body: of each ``(n,)``.
+        points: current positions ``(n, gdim)``.
+        committed: positions at the end of the last accepted step ``(n, gdim)``.
+        drawn: positions in the reference configuration ``(n, gdim)``.
+        reach: search distance, a length ``(n,)``.
+        body: body of each node ``(n,)``.
         node: global number ``(n,)``.
         corner: whether it lies on a sharp convex edge ``(n,)``.
         cones: normals of the facets around them, now and in the reference configuration ``(n, c, 2, gdim)``.
@@ -96,19 +96,19 @@ class Asking(NamedTuple):
     held: Ints
 
 
-#: What placing bodies changes in ``Neighbours``; a step that begins anew has it as it began.
+#: Attributes of ``Neighbours`` that change when bodies are placed; a repeated step restores them.
 OF_A_STEP = ("lists", "body", "held", "_reach", "_lasts", "_made_at", "_overlap", "_farther")
 
 
 class Neighbours:
-    """Lists of what surface nodes may touch, one for each of the bodies that a node may touch at once (collective).
+    """Lists of the facets that surface nodes may touch, one for each of the bodies that a node may touch at once (collective).
 
     Args:
         skin: the surfaces.
         nodes: owned surface nodes that may touch others ``(n,)``.
-        place: of each body in the order in which they follow each other ``(n_bodies,)``.
+        place: position of each body in the order in which they follow each other ``(n_bodies,)``.
         apart: pairs of sets of facets that never touch each other, as local nodes and this rank's facets of both, each once.
-        overlap: bound on what nodes may be inside others at the start, a length.
+        overlap: bound on the initial penetration of nodes, a length.
         n_lists: how many bodies a node may touch at once.
         itself: which bodies may touch themselves ``(n_bodies,)``.
     """
@@ -121,14 +121,14 @@ class Neighbours:
         self.apart, self._overlap, self.itself = apart, overlap, itself
         config = self._config = skin.config
         watched = np.unique(np.concatenate([skin.dofs.ravel(), nodes]))
-        #: Nodes whose motion counts, body by body, and where those of each body begin.
+        #: Nodes whose motion counts, sorted by body, and the index of the first node of each body.
         self._watched = watched[np.argsort(skin.body_of_node[watched], kind="stable")]
         self._bodies, self._begin = np.unique(skin.body_of_node[self._watched], return_index=True)
         self._committed = config.x.copy()
         self._last_motion = np.zeros(skin.n_bodies)
         #: Facets that hold nodes now, by list ``(n_lists, n)``, -1 for none.
         self.held: Ints = np.full((n_lists, len(nodes)), -1)
-        #: Number of the order that they keep.
+        #: Number of the order of the bodies.
         self.number = next(_orders)
         self._made_at: Array | None = None
         self._kept, self._farther = False, 0.0
@@ -148,10 +148,10 @@ class Neighbours:
         return most
 
     def update(self) -> None:
-        """Make the lists anew if a body has moved farther than they reach (collective)."""
+        """Rebuild the lists if a body has moved farther than they reach (collective)."""
         if self._kept:
             self._last_motion, self._committed, self._kept = self._motion(self._committed), self._config.x.copy(), False
-            # what was inside at the start has been taken out by now
+            # initial penetrations have been removed by now
             if (self._reach < self._overlap).any():
                 self._made_at = None
             self._overlap = self._farther = 0.0
@@ -163,16 +163,16 @@ class Neighbours:
             self._at_start = {name: getattr(self, name) for name in OF_A_STEP} | {"held": self.held.copy()}
 
     def begin_step(self) -> None:
-        """A step begins, for the first time or anew: with the lists that an earlier attempt began with, whatever it has made."""
+        """Begin a step, or repeat it: restore the lists with which an earlier attempt began."""
         if self._at_start is not None and not self._kept:
             vars(self).update(self._at_start, held=self._at_start["held"].copy())
 
     def commit(self) -> None:
-        """A step has been kept, or is gone back to: nodes are in front of facets from where they are when they are next looked at."""
+        """Accept a step, or return to one: at the next update, the current positions decide which facets nodes are in front of."""
         self._kept = True
 
     def look_farther(self) -> bool:
-        """Reach four times as far from the next placement on, until a step is kept: whether that is not beyond the whole model yet."""
+        """Extend the reach by a factor of 4 until a step is accepted: False if it already exceeds the size of the model."""
         if self._farther > self._config.size:
             return False
         self._farther, self._made_at = 4.0 * max(self._farther, float(self._reach.max(initial=0.0))), None
@@ -185,7 +185,7 @@ class Neighbours:
         self._reach = np.maximum(np.maximum(AHEAD_AT_REST * skin.size, STEPS_AHEAD * motion), max(self._farther, self._overlap))
         self._made_at = config.x.copy()
         self.times_made += 1
-        # what facets' ranks have to know of a node, which goes where a facet may be in reach
+        # data of a node are sent to all ranks with a facet that may be in reach
         n, g, own = len(self.nodes), config.gdim, skin.body_of_node[self.nodes]
         points, reach = self._made_at[self.nodes], self._reach[own]
         ahead = self._reach[skin.body]
@@ -199,7 +199,7 @@ class Neighbours:
         *told, rows = exchange.send(*about, np.arange(n))
         node, facet, cosine, *about_pairs = self._pairs(Asking(*told))
         home, row = exchange.origins[node], rows[node]
-        # which list each pair belongs to, and which sides of the facet nothing listed lies behind, is known where the node is
+        # the rank of the node decides on the list of each pair, and on the sides of facets beyond which no facet is listed
         meeting, first = Exchange.to(comm, home), self.skin.first[comm.rank]
         pairs = meeting.send(row, skin.body[facet], facet + first, skin.edges.across[facet], skin.keys[facet], *about_pairs)
         seen = self._on_this_side(pairs[0], pairs[1], *pairs[4:])
@@ -209,7 +209,7 @@ class Neighbours:
         which, ends = np.full(len(seen), -1), np.ones((len(seen), skin.edges.across.shape[1]), bool)
         which[seen] = np.where(self.body[:, rows] == bodies, np.arange(self._n)[:, None], -1).max(axis=0)
         ends[seen] = self._open_sides(rows, facets, across)
-        # bodies that are in reach, but on no list, may not be met before lists are made anew
+        # lists are rebuilt before a node can meet a body that is in reach, but on no list
         left, lasts = which[seen] < 0, self._reach.copy()
         for body in (own[rows[left]], bodies[left]):
             np.minimum.at(lasts, body, 0.5 * distance[left])
@@ -223,19 +223,19 @@ class Neighbours:
     def _on_this_side(
         self, row: Ints, body: Ints, key: Ints, distance: Array, faces: Bools, front: Bools, normal: Array
     ) -> Bools:
-        """Which facets may hold nodes ``(k,)``: those that the nodes are in front of, and of the same body those on the same side.
+        """Which facets may hold nodes ``(k,)``: facets with the node in front, and facets of the same body on the same side.
 
-        A node outside a round body is behind the planes of facets that it may slide to next. They are turned by a right angle or less
-        from the nearest of the facets that it is in front of; the back of a plate is turned away. Of a node that is inside a body at
-        the start the nearest facet of all counts.
+        A node outside a round body is behind the planes of facets that it may slide to next. They are accepted unless they are
+        turned away from the nearest facet that has the node in front, as the back of a plate is. For a node inside a body at the
+        start, the nearest of all facets counts.
 
         Args:
             row: places of nodes ``(k,)``.
             body: of the facets.
-            key: of the facets, alike in any partition.
-            distance: of nodes from them.
-            faces: whether they face the nodes; the others are here at the start alone.
-            front: whether the nodes are in front of them.
+            key: of the facets, independent of the partition.
+            distance: of the nodes from the facets.
+            faces: whether the facets face the nodes; other facets occur only at the start.
+            front: whether the nodes are in front of the facets.
             normal: of the facets ``(k, gdim)``.
         """
         known, pair = np.unique(row * self.skin.n_bodies + body, return_inverse=True)
@@ -250,12 +250,12 @@ class Neighbours:
         return np.asarray(faces & np.where(inside[pair], beside, front | (beside & (front & faces)[nearest])))
 
     def _open_sides(self, row: Ints, facet: Ints, across: Ints) -> Bools:
-        """Sides of facets behind which no facet is listed for the same node, so that the foot lies past an end there ``(k, n_sides)``.
+        """Sides of facets beyond which no facet is listed for the same node: closest points there are past an end ``(k, n_sides)``.
 
         Args:
             row: places of nodes ``(k,)``.
             facet: numbers of the facets listed for them, over all ranks.
-            across: those of their neighbours ``(k, n_sides)``, -1 for none.
+            across: numbers of their neighbours ``(k, n_sides)``, -1 for no neighbour.
         """
         most = self.skin.first[-1]
         listed = np.sort(row * most + facet)
@@ -267,8 +267,8 @@ class Neighbours:
         """Nodes and this rank's facets that may touch.
 
         Returns:
-            Places of nodes, facets, least cosines between their normals, distances, whether they face each other, whether the nodes are
-            in front ``(k,)``, and the facets' normals ``(k, gdim)``.
+            Indices of nodes, facets, least cosines between their normals, distances, whether they face each other, whether the
+            nodes are in front ``(k,)``, and the facets' normals ``(k, gdim)``.
         """
         assert self._made_at is not None
         skin, x, points = self.skin, self._made_at[self.skin.dofs], of.points
@@ -287,7 +287,7 @@ class Neighbours:
         cosines = np.einsum("kcg,kg->kc", of.cones[i, :, 0], normal)
         front, cosine = self._in_front(of.committed[i], f), cosines.min(axis=1, initial=0.0)
         faces = cosine < -FACED
-        # at the start facets that look away tell as well whether a node is inside a body
+        # at the start, facets that do not face the node also decide whether it is inside a body
         kept = np.where(same, faces & front, faces | (self._overlap > 0.0))
         kept[same] &= of.corner[i[same]] | self._first_of_itself(of, i[same], f[same], cosines[same])
         holds = (of.held[i] == (f + self.skin.first[self._config.comm.rank])[:, None]).any(axis=1)
@@ -300,12 +300,12 @@ class Neighbours:
 
     @cached_property
     def sides(self) -> Bools:
-        """In which sets of facets that never touch each other nodes are ``(n, s)``."""
+        """Membership of the nodes in the sets of facets that never touch each other ``(n, s)``."""
         sets = [a[0] for a in self.apart] + [a[2] for a in self.apart] + [np.zeros(self._config.n_local, bool)]
         return np.column_stack([a[self.nodes] for a in sets])
 
     def excluded(self, sides: Bools, facet: Ints) -> Bools:
-        """Which nodes in these sets ``(k, s)`` never touch this rank's facets ``(k,)``."""
+        """Whether nodes of these sets ``(k, s)`` never touch this rank's facets ``(k,)``."""
         out, n = np.zeros(len(facet), bool), len(self.apart)
         for k, (_, a, _, b) in enumerate(self.apart):
             out |= (sides[:, k] & b[facet]) | (sides[:, n + k] & a[facet])
@@ -318,32 +318,32 @@ class Neighbours:
         return np.asarray(height >= -BEHIND * np.minimum(skin.depth, skin.radius)[facet])
 
     def _first_of_itself(self, of: Asking, node: Ints, facet: Ints, cosines: Array) -> Bools:
-        """Which nodes ``(k,)`` of a body follow its facets rather than these those.
+        """In self-contact, decide for each pair which side is the contactor: True where the node follows the facet ``(k,)``.
 
         Args:
             of: the nodes.
-            node: their places ``(k,)``.
+            node: their indices ``(k,)``.
             facet: of this rank.
-            cosines: between their normals and those of the facets around the node ``(k, c)``.
+            cosines: between the facet's normal and the normals of the facets around the node ``(k, c)``.
         """
         skin, d = self.skin, DIRECTION[: self._config.gdim]
         middle, normal = skin.middles(self._config.X[skin.dofs])
-        # the normal of that facet around the node that faces most squarely
+        # reference normal, around the node, that faces the facet most directly
         own = of.cones[node, cosines.argmin(axis=1), 1] if len(node) else np.zeros((0, len(d)))
-        # where normals are alike, as on one side of a strip that is folded, places tell
+        # if normals are equal, as on one side of a folded strip, positions decide
         return np.asarray((own - normal[facet] + (of.drawn[node] - middle[facet]) / self._config.size) @ d > 0)
 
     def _shared_out(self, row: Ints, body: Ints, distance: Array) -> Ints:
-        """The body that each node may touch by each list, -1 for none ``(n_lists, n)``: that which holds it now, then the nearest.
+        """Body of each node on each list, -1 for no body ``(n_lists, n)``: first the body that holds the node now, then the nearest.
 
         Args:
             row: places of nodes ``(k,)``.
-            body: near them.
+            body: bodies near them.
             distance: of a node from the body.
         """
         order = np.lexsort((body, distance, row))
         row, body = row[order], body[order]
-        # several ranks may tell of one body
+        # several ranks may report the same body
         _, first = np.unique(row * self.skin.n_bodies + body, return_index=True)
         first.sort()
         row, body = row[first], body[first]
@@ -361,11 +361,11 @@ class Neighbours:
         return found
 
     def _list(self, home: Ints, row: Ints, facet: Ints, more: tuple[Array, Bools], empty: bool) -> Listing:
-        """The list of pairs, whose nodes are ``row (k,)`` of the ranks ``home (k,)`` (collective)."""
+        """A list of pairs of nodes, ``row (k,)`` on the ranks ``home (k,)``, and facets (collective)."""
         comm = self._config.comm
         n = len(self.nodes) if comm.size == 1 else int(reduced(comm, len(self.nodes), op=MPI.MAX))
         asked, node = np.unique(home * n + row, return_inverse=True)
-        # ranks that have facets tell so; nodes then come in the order in which they were asked for
+        # ranks with facets request their nodes, which then arrive in the requested order
         back = Exchange.to(comm, asked // max(n, 1))
         (rows,) = back.send(asked % max(n, 1))
         ends = np.searchsorted(back.origins, np.arange(comm.size + 1))
@@ -373,15 +373,15 @@ class Neighbours:
 
 
 class Neighbour(MeshTarget):
-    """What nodes may touch by one of the lists: facets of the body that each has on it.
+    """The target of one list: for each node, the listed facets of one body.
 
     Args:
         neighbours: the lists.
         number: of the list.
-        averaged: as of ``MeshTarget``.
+        averaged: see ``MeshTarget``.
     """
 
-    #: Lists tell what is near.
+    #: Nearby facets are found from the lists, not by bounding boxes.
     measures = False
 
     def __init__(self, neighbours: Neighbours, number: int, averaged: bool = False):
@@ -389,47 +389,47 @@ class Neighbour(MeshTarget):
         self.neighbours, self.number = neighbours, number
 
     def hold(self, facet: Ints) -> None:
-        """Take the facets that hold the contactors now ``(n,)``, -1 for none."""
+        """Set the facets that hold the contactors now ``(n,)``, -1 for no facet."""
         self.neighbours.held[self.number] = facet
 
     def nothing_near(self) -> bool:
-        """Whether no contactor of any rank has anything near on this list (collective)."""
+        """Whether this list has no pair on any rank (collective)."""
         self.neighbours.update()
         return self.neighbours.lists[self.number].empty
 
     @property
     def beside_themselves(self) -> Ints:
-        """Contactors that have facets of their own body on a list; for lists after the first none, which tell of no passage."""
+        """Contactors with facets of their own body on a list; only the first list reports them, for the check of tunnelling."""
         n = self.neighbours
         own = n.skin.body_of_node[n.nodes]
         return np.flatnonzero((n.body == own).any(axis=0) & n.itself[own] & (self.number == 0))
 
     @property
     def behind_others(self) -> Bools:
-        """Contactors that follow other bodies, ``(n,)``; for lists after the first none, which tell of no passage."""
+        """Contactors that follow other bodies ``(n,)``; only the first list reports them, for the check of tunnelling."""
         n = self.neighbours
         last = n.place[n.skin.size > 0].max()
         return np.asarray((n.place[n.skin.body_of_node[n.nodes]] < last) & (self.number == 0))
 
     def told(self, which: Ints) -> Ints:
-        """Place of the contactors' bodies in the order, bodies, nodes and sets ``(k, 3 + s)``."""
+        """Visibility keys of contactors: position of their body in the order, body, global node and sets ``(k, 3 + s)``."""
         n, nodes = self.neighbours, self.neighbours.nodes[which]
         body = n.skin.body_of_node[nodes]
         return np.column_stack([n.place[body], body, n.skin.config.to_global(nodes), n.sides[which]])
 
     def may_touch(self, told: Ints, facet: Ints) -> Bools:
-        """Whether this rank's facets ``(k,)`` are of bodies that the contactors in ``told`` follow."""
+        """Whether this rank's facets ``(k,)`` belong to bodies that the contactors with keys ``told`` follow."""
         n = self.neighbours
         return np.asarray((n.place[n.skin.body[facet]] > told[:, 0]) & ~n.excluded(told[:, 3:] > 0, facet))
 
     def of_itself(self, told: Ints, facet: Ints) -> Bools:
-        """Whether this rank's facets ``(k,)`` are of the own bodies of the contactors in ``told``, but do not meet at them."""
+        """Whether this rank's facets ``(k,)`` belong to the contactor's own body, but not to the contactor, from keys ``told``."""
         n = self.neighbours
         others = (n.skin.body[facet] == told[:, 1]) & (n.skin.nodes[facet] != told[:, 2, None]).all(axis=1)
         return np.asarray(others & ~n.excluded(told[:, 3:] > 0, facet))
 
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
-        """Closest points of contactors on what they may touch; far away where there is nothing (collective)."""
+        """Closest points of contactors on the listed facets; ``nowhere`` for contactors without any (collective)."""
         self.neighbours.update()
         listed, n = self.neighbours.lists[self.number], len(self.neighbours.nodes)
         if which is not None:

@@ -1,6 +1,6 @@
-"""Which facets of a target may lie opposite to a contactor's facets, wherever they are.
+"""Search for the target facets that may lie opposite to contactor facets, on any rank.
 
-Target facets travel to the ranks whose contactor facets may see them, and to no others; no rank ever holds a whole surface.
+Target facets are sent only to ranks whose contactor facets may face them; no rank holds a whole surface.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ STILL_FACING = 0.2
 
 @dataclass(frozen=True)
 class Opposite:
-    """Pairs of facets, ordered by contactor facet and then by what tells the target's in any partition.
+    """Pairs of facets, ordered by contactor facet and then by the key of the target facet.
 
     Attributes:
-        facet: number of the contactor facet among those asked for ``(k,)``, ascending.
+        facet: number of the contactor facet among the given ones ``(k,)``, ascending.
         x: nodes of the target facet ``(k, nt, gdim)``.
         nodes: their global block numbers ``(k, nt)``.
-        key: what tells the target facet in any partition ``(k,)``.
+        key: of the target facet, independent of the partition ``(k,)``.
     """
 
     facet: Ints
@@ -54,9 +54,9 @@ def find_opposite(
         planes: of the contactor facets ``(m,)``.
         x: their nodes ``(m, nc, gdim)``.
         reach: lengths ``(m,)``.
-        faced: what tells the contactor facets in any partition ``(m,)``, and by these keys the contactor and target facets that have
-            faced each other before ``(p, 2)``; None if none have.
-        told: what tells which of the target's facets they may touch ``(m, k)``, as its ``allowed``; None if all.
+        faced: keys of the contactor facets, independent of the partition ``(m,)``, and pairs of keys of contactor and target facets
+            that have faced each other before ``(p, 2)``; None without such pairs.
+        told: keys that decide which target facets they may touch, see ``MeshTarget.allowed`` ``(m, k)``; None allows all.
     """
     comm = target.comm
     middle = x.mean(axis=1)
@@ -77,7 +77,7 @@ def find_opposite(
 
 
 def thickness(target: MeshTarget, most: float) -> Array:
-    """How far behind this rank's facets the surface's other side is, at the least, no farther than ``most`` ``(m,)`` (collective)."""
+    """Least distance of the surface's other side behind this rank's facets, at most ``most`` ``(m,)`` (collective)."""
     shape, facets = target.shape, target.facets
     x, thick = facets.x, np.full(len(facets.dofs), most)
     planes = Planes.of(shape, x, facets.sign)
@@ -91,7 +91,7 @@ def thickness(target: MeshTarget, most: float) -> Array:
 
 
 def _allowed(target: MeshTarget, told: Array, facet: Ints, opposite: Ints) -> tuple[Ints, Ints]:
-    """Those pairs of facets that may touch each other, by what contactor facets have ``told (m, k)``."""
+    """The pairs of facets that may touch each other, by the keys ``told (m, k)`` of the contactor facets."""
     if not told.shape[1]:
         return facet, opposite
     may = target.allowed(told[facet], opposite)
@@ -101,7 +101,7 @@ def _allowed(target: MeshTarget, told: Array, facet: Ints, opposite: Ints) -> tu
 def _facing(
     shape: FacetShape, planes: Planes, faced: tuple[Ints, Ints] | None, facet: Ints, y: Array, nodes: Ints, key: Ints, sign: Array
 ) -> Opposite:
-    """Those candidates that face each other now, or have ``faced`` each other before, in order."""
+    """The candidates that face each other now, or have ``faced`` each other before, in order."""
     kept = -np.einsum("kg,kg->k", planes.normal[facet], Planes.of(shape, y, sign).normal) > FACING
     if faced is not None and len(faced[1]):
         keys, before = faced
@@ -117,13 +117,13 @@ def _facing(
 
 
 def _boxes_near(target: MeshTarget, here: Array, middle: Array, within: Array) -> Array:
-    """Whether the facets of each rank may be within a distance of points ``(size, m)`` (collective)."""
+    """Whether a facet of each rank may lie within a distance of the points ``(size, m)`` (collective)."""
     near, _ = target.bounds(middle, here)
     return np.asarray(near <= within)
 
 
 def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reach: Array, normal: Array) -> tuple[Ints, Ints]:
-    """Contactor facets, by middle, radius, reach and normal, and this rank's target facets that may lie upon them, ``(k,)`` each."""
+    """Contactor facets, by middle, radius, reach and normal, and this rank's target facets that may cover them, ``(k,)`` each."""
     none = np.zeros(0, dtype=np.int64)
     if not len(middle) or not len(y):
         return none, none
@@ -144,10 +144,10 @@ def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reac
 
 
 def _balls_along(middle: Array, radius: Array, reach: Array, normal: Array, places: Array) -> tuple[Array, Ints, Array]:
-    """Balls that together cover the places within ``reach`` of facets along their normals.
+    """Balls that together cover the given positions within ``reach`` of facets along their normals.
 
-    Each facet of ``radius (m,)`` sees a tube. A single ball around the tube would hold the more facets beside it, the farther the
-    target is away. Of the tube only the part is covered that the box around all ``places (k, gdim)`` reaches into.
+    The search region of a facet of ``radius (m,)`` is a tube. One ball around a long tube would contain many facets outside it.
+    Only the part of the tube inside the bounding box of ``places (k, gdim)`` is covered.
 
     Returns:
         Middles ``(k, gdim)``, the facet of each ``(k,)`` and radii ``(k,)``.

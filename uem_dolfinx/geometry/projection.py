@@ -1,4 +1,4 @@
-"""Where points stand relative to a target: gap, normal, weights and the second derivative of the gap."""
+"""Projection of points onto a target: gap, normal, weights and the second derivative of the gap."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ AT_VERTEX = 1e-9
 
 
 class Projection(Protocol):
-    """Where points stand relative to a target: the one thing the uniting equations ask of it."""
+    """Projection of points onto a target: all data that the constraint equations need."""
 
     @property
     def gap(self) -> Array:
-        """Signed distance less the ``offset`` ``(n,)``, positive outside."""
+        """Signed distance minus the ``offset`` ``(n,)``, positive outside."""
 
     @property
     def offset(self) -> Array | None:
-        """By how much the surfaces are taken to be thicker ``(n,)``; None for nothing."""
+        """Additional thickness of the surfaces ``(n,)``; None without offset."""
 
     @property
     def height(self) -> Array:
@@ -51,7 +51,7 @@ class Projection(Protocol):
 
     @property
     def weights(self) -> Array:
-        """Shape functions at the foot ``(n, nn)``."""
+        """Shape functions at the closest point ``(n, nn)``."""
 
     @property
     def facet(self) -> Ints:
@@ -59,29 +59,29 @@ class Projection(Protocol):
 
     @property
     def foot(self) -> Array:
-        """Where the force on the target acts ``(n, gdim)``: the closest point of a mesh; a rigid target takes it at the contactor."""
+        """Point of action of the force on the target ``(n, gdim)``: closest point on a mesh, contactor position for a rigid target."""
 
     @property
     def facet_size(self) -> Array:
-        """Length of a side of the facet ``(n,)``; infinite where the target has no facets."""
+        """Length of a side of the facet ``(n,)``; infinite for targets without facets."""
 
     @property
     def beyond(self) -> Array:
-        """How far the point lies past an open end of the target, in the tangent plane ``(n, gdim)``."""
+        """Vector of the point past an open end of the target, in the tangent plane ``(n, gdim)``."""
 
     @property
     def way_beyond(self) -> Array:
-        """Length of that ``(n,)``."""
+        """Length of ``beyond`` ``(n,)``."""
 
     @property
     def from_end(self) -> Array:
-        """How far the foot is from an open end of the target on its facet, as part of the facet ``(n,)``; infinite without any."""
+        """Distance of the closest point from an open end on its facet, in reference coordinates ``(n,)``; infinite without open ends."""
 
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap with respect to contactor and target nodes ``(k, (1 + nn) g, (1 + nn) g)``."""
 
     def turnings(self, which: Ints, s: Array) -> Array:
-        """Derivative of the rows along tangents ``s (k, gdim)``, which turn with the normal ``(k, (1 + nn) g, (1 + nn) g)``."""
+        """Derivative of the rows along tangents ``s (k, gdim)``, which rotate with the normal ``(k, (1 + nn) g, (1 + nn) g)``."""
 
     def normal_slopes(self, which: Ints) -> Array:
         """Derivative of the normal with respect to contactor and target nodes ``(k, g, (1 + nn) g)``."""
@@ -91,10 +91,10 @@ class Target(Protocol):
     """Anything that points can be projected onto, meshed or rigid.
 
     Attributes:
-        n_nodes: that a contactor follows; 0 if the target is rigid.
-        stride: how far a contactor may move past it unseen, a length.
-        averaged: whether normals are averaged at nodes and interpolated, so that they lean from the facets'.
-        motion: of a rigid target from its reference position, a ``rigid.Motion``; None without any, and of a mesh.
+        n_nodes: number of nodes that a contactor follows; 0 if the target is rigid.
+        stride: largest motion of a contactor that cannot pass through the target unnoticed, a length.
+        averaged: whether normals are averaged at nodes and interpolated, so that they differ from the facets' normals.
+        motion: of a rigid target from its reference position, a ``rigid.Motion``; None without motion, and for a mesh.
     """
 
     n_nodes: int
@@ -104,7 +104,7 @@ class Target(Protocol):
 
     @property
     def faceted(self) -> bool:
-        """Whether normals jump from facet to facet."""
+        """Whether normals are discontinuous between facets."""
 
     @property
     def dofs(self) -> Indices:
@@ -112,42 +112,42 @@ class Target(Protocol):
 
     @property
     def keys(self) -> Ints:
-        """What tells each of this rank's facets in any partition ``(m,)``."""
+        """Key of each of this rank's facets, independent of the partition ``(m,)``."""
 
     def project(self, points: Array) -> Projection:
         """Closest points in the current configuration (collective)."""
 
     def follow(self, points: Array, old: Any) -> Projection:
-        """Gaps with the feet, normals and weights of an earlier projection of this target (small sliding, collective)."""
+        """Gaps with closest points, normals and weights of an earlier projection of this target (small sliding, collective)."""
 
     def continued(self, projection: Any, which: Ints) -> Projection:
-        """The projection with some feet moved past the target's open end, as far as their points lie beyond it."""
+        """The projection with some closest points continued past the target's open end, up to below their points."""
 
     def chords(self, projection: Any) -> Array:
-        """Weights of the straight pieces between the nodes of curved facets at the feet ``(n, nn)`` [UEM, 4.5]."""
+        """Weights of the straight pieces between the nodes of curved facets at the closest points ``(n, nn)`` [UEM, 4.5]."""
 
     def reference(self, gdim: int) -> Array:
         """Point about which the moment on the target is taken ``(gdim,)``."""
 
     def keys_of(self, facet: Ints) -> Ints:
-        """What tells facets in any partition, from their numbers ``(n,)``; -1 for -1 (collective)."""
+        """Keys of facets, independent of the partition, from their numbers ``(n,)``; -1 for -1 (collective)."""
 
     def facets_of(self, keys: Ints) -> Ints:
-        """Numbers of the facets that keys tell ``(n,)``; -1 where there is none (collective)."""
+        """Numbers of the facets with these keys ``(n,)``; -1 for unknown keys (collective)."""
 
 
 @dataclass(frozen=True)
 class FacetProjection:
-    """Projection onto meshed facets; fields as in ``Projection``, and the facet's geometry at the foot.
+    """Projection onto meshed facets; fields as in ``Projection``, and the facet's geometry at the closest point.
 
     Attributes:
-        xi: reference coordinates of the foot ``(n, fdim)``.
+        xi: reference coordinates of the closest point ``(n, fdim)``.
         foot: closest points ``(n, gdim)``.
         averaged: interpolated nodal normals ``(n, gdim)``.
         x: positions of the facet's nodes ``(n, nn, gdim)``.
         dN: derivatives of the weights ``(n, nn, fdim)``.
         ddN: second derivatives ``(n, nn, fdim, fdim)``.
-        shape_operator: derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero where the normal is the facet's.
+        shape_operator: derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero for the facet's own normal.
     """
 
     gap: Array
@@ -189,18 +189,18 @@ class FacetProjection:
         return replace(self, **updates)
 
     def with_those(self, which: Ints, other: FacetProjection) -> FacetProjection:
-        """Copy with the points ``which (k,)`` where another projection, of k points, has them."""
+        """Copy with the rows ``which (k,)`` replaced by another projection of k points."""
         return self.with_rows(which, {f.name: v for f in fields(self) if (v := getattr(other, f.name)) is not None})
 
     def across_edges(self, points: Array, offset: Array) -> FacetProjection:
-        """Of ``points (n, gdim)`` at ``offset (n,)``, those in front of an edge that it rounds, with the normal along the way from it."""
+        """Copy with normals from the edge to ``points (n, gdim)`` near convex edges, which an ``offset (n,)`` rounds."""
         away = points - self.foot
         length, lean = np.linalg.norm(away, axis=1), np.einsum("ng,ng->n", away, self.normal)
-        # the way of a point on its foot has a direction by rounding alone
+        # the direction from the closest point is rounding if the distance vanishes
         beside = (length > ALONG_NORMAL * self.facet_size) & (np.abs(lean) < (1.0 - ALONG_NORMAL) * length)
         beside &= ~self.beyond.any(axis=1)
         side = np.where(lean < 0.0, -1.0, 1.0)
-        # an arc about the edge with the offset as its radius, and as far again on both sides
+        # an arc about the edge with the offset as radius, extended to twice the radius
         beside &= (np.abs(offset) > ROUNDS_AN_EDGE * self.facet_size) & (side * offset > 0.0) & (length < 2.0 * np.abs(offset))
         n = side[:, None] * away / np.where(length > 0.0, length, 1.0)[:, None]
         return replace(self, gap=np.where(beside, side * length, self.gap), normal=np.where(beside[:, None], n, self.normal))
@@ -212,7 +212,7 @@ class FacetProjection:
     def hessians(self, which: Ints) -> Array:
         """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).
 
-        With the moving tangents ``t_a``, ``D_a`` the derivative of the foot's coordinate and ``N_a`` that of the facet's
+        With the moving tangents ``t_a``, ``D_a`` the derivative of the closest point's coordinate and ``N_a`` that of the facet's
         slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b;
         on a straight 2D facet this is the formula of the method's description.
         """
@@ -223,14 +223,14 @@ class FacetProjection:
 
     @cached_property
     def _from_edge(self) -> Bools:
-        """Whether the normal is the way from a convex edge, neither the facet's nor an averaged one ``(n,)``; see ``across_edges``."""
+        """Whether the normal points from a convex edge, and is neither the facet's nor averaged ``(n,)``; see ``across_edges``."""
         t = np.einsum("naf,nag->nfg", self.dN, self.x)
         leans = np.abs(np.einsum("nfg,ng->nf", t, self.normal)) > FROM_EDGE * np.linalg.norm(t, axis=2)
         own = (self.normal != self.averaged).any(axis=1) & (self.facet >= 0) & ~self.beyond.any(axis=1)
         return np.asarray(own & leans.any(axis=1))
 
     def turnings(self, which: Ints, s: Array) -> Array:
-        """Derivative of the rows ``(s, -N_a s)`` along tangents ``s (k, gdim)``, which turn with the normal as the foot moves.
+        """Derivative of the rows ``(s, -N_a s)`` along tangents ``s (k, gdim)``, which rotate with the normal.
 
         The normal changes by ``- t^a (N_a + b D)``, the tangent by as much along the normal, and the shape functions with ``D_a``.
         """
@@ -243,7 +243,7 @@ class FacetProjection:
         return np.concatenate([ds[:, None], -on_target], axis=1).reshape(k, size, size)
 
     def normal_slopes(self, which: Ints) -> Array:
-        """Derivative of the normal as the foot moves and the facet turns."""
+        """Derivative of the normal with the motion of the closest point and the rotation of the facet."""
         t, m, _, _, _, L = _foot_derivatives(*self._at(which))
         return -np.einsum("kfg,kfi->kgi", t, np.linalg.solve(m, L))
 
@@ -254,7 +254,7 @@ class FacetProjection:
 def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, shape_operator: Array) -> Array:
     """Second derivatives of the gap ``(k, (1 + nn) g, (1 + nn) g)``; arguments as the fields of ``FacetProjection``.
 
-    A side of a facet is served too: ``dN`` then has one column, and ``n`` is any direction across the side.
+    This includes sides of facets: ``dN`` then has one column, and ``n`` is any direction across the side.
     """
     _, m, b, N, D, L = _foot_derivatives(n, g, w, dN, ddN, x, shape_operator)
     H = -np.einsum("kfi,kfj->kij", D, N)
@@ -263,7 +263,7 @@ def gap_hessians(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array, 
 
 
 def _hessians_at_edges(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: Array) -> Array:
-    """Second derivatives of the distance from a vertex, or from an edge that the foot slides along; arguments as of ``gap_hessians``."""
+    """Second derivatives of the distance from a vertex, or from an edge with sliding closest point; arguments as for ``gap_hessians``."""
     (k, nn, _), gdim = dN.shape, n.shape[1]
     size = (1 + nn) * gdim
     relative = np.concatenate([np.ones((k, 1)), -w], axis=1)
@@ -274,7 +274,7 @@ def _hessians_at_edges(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: A
         return H
     n, g, w, dN, ddN, x, relative = (v[i] for v in (n, g, w, dN, ddN, x, relative))
     t = np.einsum("kaf,kag->kfg", dN, x)
-    # the edge is the direction in the facet that is square to the normal
+    # the edge is the direction in the facet perpendicular to the normal
     lean = np.einsum("kfg,kg->kf", t, n)
     edge = np.stack([-lean[:, 1], lean[:, 0]], axis=1)
     edge /= np.linalg.norm(edge, axis=1)[:, None]
@@ -288,7 +288,7 @@ def _hessians_at_edges(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: A
 
 
 def foot_slopes(p: FacetProjection, which: Ints) -> tuple[Array, Array]:
-    """Tangents at feet ``(k, fdim, gdim)``, and derivatives of their coordinates by points and nodes ``(k, fdim, (1 + nn) gdim)``."""
+    """Tangents at closest points ``(k, fdim, gdim)``, and derivatives of their coordinates ``(k, fdim, (1 + nn) gdim)``."""
     t, _, _, _, D, _ = _foot_derivatives(*p._at(which))
     return t, D
 

@@ -1,7 +1,7 @@
-"""Parallel closest-point search: from contactor positions to gap, normal, weights and the facet's nodes.
+"""Parallel closest-point search: gap, normal, weights and facet nodes for the positions of contactors.
 
-A point is sent only to the ranks whose part of the target can be nearest, and only its foot and facet come back, so that no rank
-ever holds a whole surface; what follows from them is found where the point is.
+A point is sent only to ranks whose part of the target can be nearest. Only the closest point and its facet are returned, so that no
+rank holds a whole surface; derived quantities are computed on the rank of the point.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ SIDEWAYS = 0.1
 
 
 class Feet(NamedTuple):
-    """Closest points on facets: all that travels from the facets' ranks to the points'.
+    """Closest points on facets: the data sent from the ranks of facets to the ranks of points.
 
     Attributes:
         facet: number over all ranks ``(n,)``.
-        key: what tells the facet in any partition ``(n,)``.
+        key: of the facet, independent of the partition ``(n,)``.
         xi: reference coordinates ``(n, fdim)``.
-        x: the facet's nodes where they are now ``(n, nn, gdim)``.
+        x: current positions of the facet's nodes ``(n, nn, gdim)``.
         nodes: their global numbers ``(n, nn)``.
         nodal_normals: averaged normals there ``(n, nn, gdim)``.
-        sign: that turns the parametrisation's normal outwards ``(n,)``.
-        open_sides: which sides bound the surface ``(n, n_sides)``.
-        open_nodes: which nodes lie on such a side ``(n, nn)``.
-        facing: how squarely the point is in front of the facet, or behind it, a length ``(n,)``; not known of facets that were asked for.
-        cosine: between the facet's normal and that around the point which it faces most squarely, where this is known, else 0 ``(n,)``.
+        sign: factor that makes the parametrisation's normal point outwards ``(n,)``.
+        open_sides: sides that bound the surface ``(n, n_sides)``.
+        open_nodes: nodes on such sides ``(n, nn)``.
+        facing: height of the point in front of or behind the facet, see ``_facing`` ``(n,)``; zero for facets given by number.
+        cosine: least cosine between the facet's normal and the normals around the point if known, else 0 ``(n,)``.
     """
 
     facet: Ints
@@ -62,7 +62,7 @@ class Feet(NamedTuple):
 
 
 class MeshTarget:
-    """Target whose facets are spread over the ranks; if averaged, normals are interpolated from nodes, not the facets' own."""
+    """Meshed target, distributed over the ranks; if ``averaged``, normals are interpolated from averaged nodal normals."""
 
     motion: Any = None
 
@@ -74,7 +74,7 @@ class MeshTarget:
         self.n_nodes = facets.dofs.shape[1]
         corners = facets.config.X[facets.dofs[:, : len(self.shape.topology[0])]]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        # half of what the thinnest body of one cell, or its shortest facet, measures
+        # half the depth of the thinnest cell, or half the shortest side of a facet
         shortest = min(sides.min(initial=np.inf), facets.depth.min(initial=np.inf))
         self.stride = 0.5 * reduced(self.comm, float(shortest), op=MPI.MIN)
         self.first: Ints = facets.first
@@ -85,12 +85,12 @@ class MeshTarget:
 
         Args:
             points: positions.
-            which: of the contactors they are ``(n,)``, where it matters who asks; None are all.
+            which: numbers of the contactors at these points ``(n,)``, for targets that depend on the contactor; None: all contactors.
         """
         data, size = self.facets.current(corners=True), self.comm.size
         if size == 1:
             return self._evaluate(points, self._project_here(points, data))
-        # the answer of the rank that seems nearest tells who else can be as near
+        # the distance found by the rank that seems nearest excludes most other ranks
         near, far = self.bounds(points, data.x)
         first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
         found, feet = self._ask(Exchange.to(self.comm, first), data, points)
@@ -103,17 +103,17 @@ class MeshTarget:
         return self._ask(self.facets.owners(facet), self.facets.current(), points, facet)[0]
 
     def at(self, points: Array, facet: Ints, xi: Array) -> FacetProjection:
-        """Where ``points (n, gdim)`` stand relative to given places ``xi (n, fdim)`` of facets (collective)."""
+        """Projection of ``points (n, gdim)`` with given reference coordinates ``xi (n, fdim)`` of facets (collective)."""
         return self._ask(self.facets.owners(facet), self.facets.current(), points, facet, xi)[0]
 
     def follow(self, points: Array, old: FacetProjection) -> FacetProjection:
-        """Gaps of ``points (n, gdim)`` with the feet, normals and weights of an earlier projection (collective)."""
+        """Gaps of ``points (n, gdim)`` with reference coordinates, normals and weights of an earlier projection (collective)."""
         new, _ = self._ask(self.facets.owners(old.facet), self.facets.current(), points, old.facet, old.xi)
         gap = np.einsum("ng,ng->n", old.normal, points - new.foot)
         return replace(new, gap=gap, normal=old.normal, beyond=old.beyond)
 
     def nowhere(self, points: Array) -> FacetProjection:
-        """The projection of ``points (n, gdim)`` that have nothing near: no facet, no normal, and a gap as large as the model."""
+        """Projection of ``points (n, gdim)`` without a facet nearby: no facet, no normal, and the model's size as gap."""
         if self._nowhere is None or len(self._nowhere.gap) != len(points):
             n, g, nn, d = len(points), self.facets.config.gdim, self.n_nodes, self.shape.dim
             facet, none = np.zeros((nn, g)), np.zeros((n, g))
@@ -125,7 +125,7 @@ class MeshTarget:
             )  # fmt: skip
         return replace(self._nowhere, foot=points)
 
-    #: Gaps are distances everywhere, and boxes around surfaces tell which are far apart.
+    #: Gaps are distances everywhere, and bounding boxes detect surfaces that are separated.
     measures = True
 
     @property
@@ -135,7 +135,7 @@ class MeshTarget:
 
     @property
     def keys(self) -> Ints:
-        """What tells each of this rank's facets in any partition ``(m,)``."""
+        """Key of each of this rank's facets, independent of the partition ``(m,)``."""
         return self.facets.keys
 
     def continued(self, projection: FacetProjection, which: Ints) -> FacetProjection:
@@ -146,7 +146,7 @@ class MeshTarget:
         return p.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 
     def chords(self, projection: FacetProjection) -> Array:
-        """Weights of the straight pieces between the nodes of curved facets at the feet ``(n, nn)`` [UEM, 4.5]."""
+        """Weights of the straight pieces between the nodes of curved facets at the closest points ``(n, nn)`` [UEM, 4.5]."""
         return self.shape.chords(projection.xi)
 
     def reference(self, gdim: int) -> Array:
@@ -154,29 +154,29 @@ class MeshTarget:
         return np.zeros(gdim)
 
     def outward(self, projection: FacetProjection) -> Array:
-        """The facets' own outward normals at the feet, also where ``normal`` is an averaged one ``(n, gdim)``."""
+        """Outward normals of the facets at the closest points, also if ``normal`` is averaged ``(n, gdim)``."""
         own = unit_normals(Tabulated(projection.weights, projection.dN, projection.ddN), projection.x)
         return own * np.where(np.einsum("ng,ng->n", own, projection.averaged) < 0, -1.0, 1.0)[:, None]
 
     def spread(self, projection: FacetProjection) -> Array:
-        """What facets that meet at the feet push with together, over the force along their averaged normal ``(n,)`` (collective)."""
+        """Sum of facet forces at the closest points over the force along their averaged normal ``(n,)`` (collective)."""
         at_nodes = self.of_facets(projection.facet, self.facets.spread())
         return np.asarray(np.einsum("na,na->n", projection.weights, at_nodes))
 
     def keys_of(self, facet: Ints) -> Ints:
-        """What tells the facets numbered ``facet (n,)`` in any partition, -1 for -1 (collective; see ``TargetFacets.keys``)."""
+        """Keys of the facets numbered ``facet (n,)``, -1 for -1 (collective; see ``TargetFacets.keys``)."""
         return self.of_facets(facet, self.facets.keys)
 
     def told(self, which: Ints) -> Ints:
-        """What tells which facets the contactors ``which (k,)`` may pass through: nothing, they may touch all ``(k,)``."""
+        """Visibility keys of the contactors ``which (k,)``: zeros, since they may touch all facets ``(k,)``."""
         return np.zeros(len(which), np.int64)
 
     def may_touch(self, told: Ints, facet: Ints) -> Bools:
-        """Whether the contactors of ``told (k,)`` may touch this rank's facets ``(k,)``."""
+        """Whether contactors with keys ``told (k,)`` may touch this rank's facets ``(k,)``."""
         return np.ones(len(told), bool)
 
     def allowed(self, told: Array, facet: Ints) -> Bools:
-        """Whether contactor facets of which this was ``told (k, m)`` may touch this rank's facets ``(k,)``."""
+        """Whether contactor facets with keys ``told (k, m)`` may touch this rank's facets ``(k,)``."""
         return np.ones(len(facet), bool)
 
     def of_facets(self, facet: Ints, values: AnyArray) -> Any:
@@ -184,9 +184,9 @@ class MeshTarget:
         return self.facets.values_at(facet, values)
 
     def facets_of(self, keys: Ints) -> Ints:
-        """Numbers of the facets that ``keys (n,)`` tell, wherever they are now, -1 for those not of this target (collective)."""
+        """Present numbers of the facets with these ``keys (n,)``, on any rank; -1 for keys of other surfaces (collective)."""
         size, mine = self.comm.size, self.facets.keys
-        # the keys of facets and those asked for meet on the same rank
+        # known and wanted keys meet on the same rank
         known, number = Exchange.to(self.comm, mine % size).send(mine, self.first[self.comm.rank] + np.arange(len(mine)))
         order = np.argsort(known)
         known, number = known[order], np.append(number[order], -1)
@@ -204,28 +204,28 @@ class MeshTarget:
             points: ``(n, gdim)``.
             x: nodes of this rank's facets ``(m, nn, gdim)``.
         """
-        # curved facets reach out of the box of their nodes
+        # curved facets may extend beyond the box of their nodes
         return box_distances(self.comm, points, x.reshape(-1, points.shape[1]), 0.5 * (self.shape.lebesgue - 1))
 
     def _ask(
         self, exchange: Exchange, data: FacetData, points: Array, facet: Ints | None = None, xi: Array | None = None,
         found: Feet | None = None,
     ) -> tuple[FacetProjection, Feet]:  # fmt: skip
-        """Send points to ranks (with the facet, or facet and foot, if given), and keep the nearest foot, or that found before."""
+        """Send points to ranks (with facet and coordinates, if given), and keep the nearest of the closest points, including ``found``."""
         p, *rest = exchange.send(*(a for a in (points, facet, xi) if a is not None))
         if rest:
             rest[0] = rest[0] - self.first[self.comm.rank]
         feet = self._project_here(p, data, *rest)
         if self.comm.size == 1:
             return self._evaluate(points, feet), feet
-        # the answers of several ranks are judged as those of one
+        # closest points of several ranks are compared in the same way as on one rank
         rows, feet = exchange.rows, Feet._make(exchange.back(*feet))
         if found is not None:
             rows, feet = np.append(rows, np.arange(len(points))), Feet._make(map(np.concatenate, zip(feet, found)))
         return self._nearest_foot(points, rows, feet)
 
     def _nearest_foot(self, points: Array, rows: Ints, feet: Feet) -> tuple[FacetProjection, Feet]:
-        """The nearest of several feet of ``points (n, gdim)``, of places ``rows (k,)``, in the order of those that have any."""
+        """The nearest of several candidates ``feet`` of ``points (n, gdim)`` with indices ``rows (k,)``, in the order of the points."""
         answer = self._evaluate(points[rows], feet)
         distance = np.linalg.norm(points[rows] - answer.foot, axis=1)
         best = _nearest(rows, distance, feet.facing, feet.key, ON_SIDE * self.stride, feet.cosine)
@@ -249,15 +249,15 @@ class MeshTarget:
         cosine: Array | None = None,
         open_sides: Bools | None = None,
     ) -> Feet:
-        """Feet of points that have candidates, on the nearest of them.
+        """Closest points on the nearest candidates.
 
         Args:
             points: ``(n, gdim)``.
             data: of this rank's facets.
-            pairs: places of points ``(k,)``.
+            pairs: indices of points ``(k,)``.
             candidates: this rank's facets that may be nearest ``(k,)``.
-            cosine: as of ``Feet``, which tells where points are as near to several and faced alike ``(k,)``; None where it is not known.
-            open_sides: sides of these that bound the surface for their points ``(k, n_sides)``; None are those that bound it for all.
+            cosine: see ``Feet``; decides between candidates of equal distance and ``facing`` ``(k,)``; None if not known.
+            open_sides: sides of the candidates that bound the surface for their point ``(k, n_sides)``; None: boundary of the surface.
         """
         xi, d2 = closest_point(self.shape, x := data.x[candidates], points[pairs])
         tab = self.shape.tabulate(xi)
@@ -284,15 +284,15 @@ class MeshTarget:
         )  # fmt: skip
 
     def _facing(self, tab: Tabulated, away: Array, facet: Ints, data: FacetData) -> Array:
-        """How squarely points are in front of facets, or behind them if they are inside the body, a length ``(n,)``.
+        """Height of points in front of facets, or depth behind them if they are inside the body, a length ``(n,)``.
 
-        It is the height over the facet's plane, from outside, and the depth below it from inside. With an edge or an inner place for its
-        closest point, the point is on that side of the surface on which it is of the facet that it is farther from. With a corner, where
-        facets may hide each other, all of them tell it together, unless the surface ends there.
+        It is the height over the facet's plane for points outside, and the depth below it for points inside. If the closest point
+        is on an edge or inside the facet, the facet with the larger distance decides on the side of the surface. If it is a corner,
+        where facets may hide each other, all facets around it decide together, unless the surface ends there.
 
         Args:
             tab: shape functions at the closest points of the facets.
-            away: ways from there to the points ``(n, gdim)``.
+            away: vectors from the closest points to the points ``(n, gdim)``.
             facet: this rank's numbers of the facets ``(n,)``.
             data: this rank's facets.
         """
@@ -302,12 +302,12 @@ class MeshTarget:
         corner, is_open = tab.N[:, :n_corners] > 1 - ON_SIDE, self.facets.open_nodes[facet, :n_corners]
         at_corner = corner & ~is_open
         above = np.einsum("nc,ncg,ng->n", at_corner, data.corner_normals[facet], away)
-        # past the surface's end facets that share a corner there are faced alike
+        # past the end of the surface, all facets that share a corner have equal ``facing``
         past = (corner & is_open).any(axis=1) & (np.abs(height) < SIDEWAYS * np.linalg.norm(away, axis=1))
         return np.where(at_corner.any(axis=1), np.copysign(1.0, above) * height, np.where(past, 0.0, np.abs(height)))
 
     def _evaluate(self, points: Array, feet: Feet) -> FacetProjection:
-        """Gap, normal and geometry at the feet of ``points (n, gdim)``."""
+        """Gap, normal and geometry at the closest points of ``points (n, gdim)``."""
         xi, x = feet.xi, feet.x
         tab = self.shape.tabulate(xi)
         foot = np.einsum("na,nag->ng", tab.N, x)
@@ -327,11 +327,11 @@ class MeshTarget:
         shape_operator = np.einsum("naf,nag->nfg", tab.dN, feet.nodal_normals) / divisor[:, :, None]
         shape_operator -= np.einsum("nfg,ng,nh->nfh", shape_operator, averaged_normal, averaged_normal)
         shape_operator[~use_average] = 0.0
-        # along an averaged normal, which leans, the way to the facet is longer than to its closest point
+        # the distance to the facet along an inclined averaged normal exceeds the shortest distance
         lean = np.einsum("ng,ng->n", normal, facet_normal)
         gap = np.einsum("ng,ng->n", facet_normal, away) / np.where(lean > LEAST_LEAN, lean, 1.0)
         beyond = away - gap[:, None] * normal
-        # a facet may touch the surface's end with a vertex alone
+        # only a vertex of a facet may lie on the end of the surface
         at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & feet.open_nodes).any(axis=1)
         beyond[~at_end] = 0.0
         from_end = np.where(is_open, self.shape.side_distances(xi), np.inf).min(axis=1, initial=np.inf)
@@ -357,10 +357,10 @@ class MeshTarget:
 def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: float, cosine: Array | None = None) -> Ints:
     """The nearest of several candidates for each point, as indices.
 
-    The facets that share an edge are equally near to a point outside a convex edge, and to one behind a concave edge. The one that the
-    point faces most squarely counts: no point hovers in the plane of another one, and none is hidden there. Then that counts which faces
-    the point's own surface most squarely, that of the smallest ``cosine``. What is still tied goes by the facets' keys, which no
-    partition changes. Lengths that differ by no more than ``rounding``, or by a small part of the distance, are equal.
+    Facets that share an edge are equally near to a point outside a convex edge, and to one behind a concave edge. The one with the
+    largest ``facing`` is taken, so that the gap vanishes on no plane of another facet. The next criterion is the smallest
+    ``cosine``, the last one the facets' keys, which are independent of the partition. Lengths that differ by at most ``rounding``,
+    or by a small part of the distance, are equal.
     """
     n = points.max(initial=-1) + 1
     closest, most = np.full(n, np.inf), np.full(n, -np.inf)
@@ -378,13 +378,13 @@ def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: 
 
 
 def box_distances(comm: MPI.Comm, points: Array, places: Array, out: float = 0.0) -> tuple[Array, Array]:
-    """Bounds on the distance of each point from what each rank has, from the boxes around that ``(size, n)`` (collective).
+    """Bounds on the distance of each point from the positions on each rank, by their bounding boxes ``(size, n)`` (collective).
 
     Args:
         comm: communicator.
         points: ``(n, gdim)``.
-        places: that this rank's box is about ``(m, gdim)``.
-        out: part of its size by which the box is larger to each side.
+        places: positions on this rank, inside its box ``(m, gdim)``.
+        out: relative enlargement of the box to each side.
     """
     box = np.stack([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])
     boxes = np.empty((comm.size, *box.shape))
@@ -399,19 +399,19 @@ def box_distances(comm: MPI.Comm, points: Array, places: Array, out: float = 0.0
 
 
 def nearest_of(comm: MPI.Comm, points: Array, places: Array, within: float, values: Array) -> tuple[Array, Array]:
-    """Distance of each point from the nearest place of all ranks, and the values there (collective).
+    """Distance of each point from the nearest position on any rank, and the values there (collective).
 
-    A place travels only to the ranks in whose part of the points it lies.
+    Positions are sent only to ranks with points nearby.
 
     Args:
         comm: communicator.
         points: ``(n, gdim)``.
-        places: this rank's ``(m, gdim)``.
-        within: what lies farther away is not looked for; the same on all ranks.
-        values: at the places ``(m, k)``.
+        places: positions on this rank ``(m, gdim)``.
+        within: largest distance of the search; the same on all ranks.
+        values: at these positions ``(m, k)``.
 
     Returns:
-        ``(n,)``, infinite where no place is near, and ``(n, k)``, zero there.
+        Distances ``(n,)``, infinite if no position is near, and values ``(n, k)``, zero there.
     """
     near, _ = box_distances(comm, places, points)
     sent = [np.flatnonzero(n <= within * (1 + EQUALLY_NEAR)) for n in near]

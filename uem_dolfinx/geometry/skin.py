@@ -1,4 +1,4 @@
-"""Surfaces of many bodies as one: which body each facet belongs to, where edges are sharp, and which bodies follow which."""
+"""Joint surface of many bodies: the body of each facet, sharp edges, and the order in which bodies follow each other."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ class Skin(TargetFacets):
 
     Attributes:
         n_bodies: number of bodies of the mesh.
-        body_of_node: body of each local node, numbered by the first cell in the mesh's input ``(n_local,)``.
+        body_of_node: body of each local node, numbered in the order of the bodies' first cells in the mesh's input ``(n_local,)``.
         body: of each facet ``(m,)``.
-        edges: what is at each side of each facet.
-        size: mean length of the sides of each body's facets, 0 where it has none ``(n_bodies,)``.
+        edges: neighbours and sharpness at each side of each facet.
+        size: mean length of the sides of each body's facets, 0 for a body without facets ``(n_bodies,)``.
         extent: diagonal of each body's bounding box in the reference configuration ``(n_bodies,)``.
     """
 
     def __init__(self, config: Configuration, tag: Tag):
         super().__init__(config, tag, "surface")
-        #: Spread of the facets where they were asked for last; None if it was not.
+        #: Spread of the facets at their last positions; None if it has not been computed there.
         self._spread: Array | None = None
         label, self.n_bodies = find_bodies(config)
         first = np.full(self.n_bodies, np.iinfo(np.int64).max)
@@ -58,7 +58,7 @@ class Skin(TargetFacets):
         number[np.argsort(reduced(config.comm, first, op=MPI.MIN))] = np.arange(self.n_bodies)
         self.body_of_node: Ints = number[label]
         self.body: Ints = self.body_of_node[self.dofs[:, 0]]
-        #: Half of what the longest side of each facet measures ``(m,)``.
+        #: Half of the longest side of each facet ``(m,)``.
         self.radius: Array = 0.5 * self._sides().max(axis=1, initial=0.0)
         sums = np.zeros((self.n_bodies, 2))
         np.add.at(sums, self.body, np.column_stack([self._sides().mean(axis=1), np.ones(len(self.body))]))
@@ -74,12 +74,12 @@ class Skin(TargetFacets):
         return np.linalg.norm(x[:, ends[:, 1]] - x[:, ends[:, 0]], axis=2)
 
     def order(self, first: list[Tag], rigid: Bools | None = None) -> Ints:
-        """Place of each body in the order in which they follow each other, each those behind it ``(n_bodies,)`` (collective).
+        """Position of each body in the order; each body follows the later ones ``(n_bodies,)`` (collective).
 
         Args:
             first: parts of bodies that come first, in this order; then the finer ones.
-            rigid: nodes whose surface moves as a rigid body ``(n_owned,)``; None for none. Bodies whose whole surface does come last: as
-                contactors, more than three of their nodes in the plane, six in space, would depend on each other.
+            rigid: nodes on surfaces that move as rigid bodies ``(n_owned,)``, or None. Bodies with an entirely rigid surface come
+                last: as contactors, more than three of their nodes in 2D, or six in 3D, would be linearly dependent.
         """
         named = np.full(self.n_bodies, len(first))
         if rigid is not None:
@@ -96,7 +96,7 @@ class Skin(TargetFacets):
         return place
 
     def bodies_of(self, tag: Tag) -> Bools:
-        """Which bodies a part of the mesh is of ``(n_bodies,)`` (collective)."""
+        """Bodies to which a part of the mesh belongs ``(n_bodies,)`` (collective)."""
         told = np.zeros(self.n_bodies, bool)
         told[self.body_of_node[surface_nodes(self.config, tag)]] = True
         return np.asarray(reduced(self.config.comm, told, op=MPI.LOR))
@@ -104,22 +104,22 @@ class Skin(TargetFacets):
     # -- sharp edges -----------------------------------------------------------------------------------------------------
 
     def _open_sides(self) -> Bools:
-        """Sides that bound the surface, or lie on a sharp convex edge, round which no facet reaches ``(m, n_sides)``."""
+        """Sides that bound the surface or lie on a sharp convex edge ``(m, n_sides)``."""
         self.edges = sharp_edges(self)
         return (self.edges.across < 0) | self.edges.convex
 
     @cached_property
     def corners(self) -> Bools:
-        """Which owned nodes lie on a sharp convex edge ``(n_owned,)`` (first time: collective)."""
+        """Owned nodes on sharp convex edges ``(n_owned,)`` (first time: collective)."""
         return self.on_sides(self.edges.convex)[: self.config.n_owned]
 
     @cached_property
     def _around(self) -> tuple[Ints, Ints, Exchange, Ints, Ints]:
-        """Facets that meet at nodes on sharp edges and are of one face (first time: collective).
+        """Facets of one smooth face that meet at nodes on sharp edges (first time: collective).
 
         Returns:
-            Facets and their nodes ``(k,)``, the exchange of these with the nodes' owners, and of those received pairs that are alike in
-            the reference configuration, each with itself.
+            Facets and their nodes ``(k,)``, the exchange of these with the nodes' owners, and pairs of received facets with similar
+            reference normals, each facet also with itself.
         """
         facet, node = np.nonzero(self.on_sides(self.edges.sharp)[self.dofs])
         exchange = Exchange.to(self.config.comm, self.config.owner_of(self.nodes[facet, node]))
@@ -137,7 +137,7 @@ class Skin(TargetFacets):
         return (facet[exchange.rows], node[exchange.rows]), sums
 
     def _placed_at(self, x: Array) -> FacetData:
-        """See ``TargetFacets``; at sharp edges normals are averaged over facets of one face alone (collective)."""
+        """See ``TargetFacets``; at sharp edges, normals are averaged only over facets of one face (collective)."""
         data = super()._placed_at(x)
         normals = data.nodal_normals.copy()
         there, sums = self._of_one_face(self._area_vectors(x))
@@ -146,7 +146,7 @@ class Skin(TargetFacets):
         return replace(data, nodal_normals=normals)
 
     def spread(self) -> Array:
-        """See ``TargetFacets``; at sharp edges of facets of one face alone (collective)."""
+        """See ``TargetFacets``; at sharp edges, only facets of one face count (collective)."""
         self.current()
         if self._spread is None:
             self._spread = super().spread()
@@ -162,8 +162,8 @@ class Skin(TargetFacets):
     def cones(self, nodes: Indices) -> Array:
         """Normals around owned nodes, now and in the reference configuration ``(n, k, 2, gdim)`` (collective).
 
-        They are those of the facets at the node, and first their mean: one that pushes on the node from without, along whatever
-        direction between the normals, faces one of these by less than 60 degrees. Zero where there are no more.
+        The first is the mean of the facets' normals, the others are the normals of the facets at the node, padded with zeros. A
+        contact force in any direction between the normals is then within 60 degrees of one of them.
         """
         config, g = self.config, self.config.gdim
         drawn = self._area_vectors(config.X[self.dofs])

@@ -1,8 +1,8 @@
-"""General contact: the surfaces of all bodies against each other and against rigid ones, by one declaration.
+"""General contact: one declaration for contact between all bodies, and with rigid surfaces.
 
-Of two bodies the nodes of one follow the facets of the other; an order of all bodies tells which, so that none follow each other in a
-ring. A node may touch as many bodies at once as others meet it in a corner of a grid of blocks, each by a contact of its own. With
-mortar there is a contact for each body that others follow.
+Of two bodies, the nodes of one follow the facets of the other. An order of all bodies decides which one follows, so that there are
+no cycles. A node may touch as many bodies at once as others meet it in a corner of a grid of blocks, each by a contact of its own.
+With mortar there is one contact for each target body.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 class GeneralContact(OfProblem, given.Sealed):
-    """Every surface against every other, and against rigid ones, by one declaration.
+    """Contact of every surface with every other, and with rigid surfaces, by one declaration.
 
     Facets far from other surfaces cost almost nothing. Bodies are the connected components of the mesh. Between two bodies the
     nodes of the one with smaller facets are contactors, between two parts of one body the nodes of one part.
@@ -54,16 +54,16 @@ class GeneralContact(OfProblem, given.Sealed):
         self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
             order of the mesh's input.
-        friction: as of ``Contact``, for all; or by pairs, ``{(one, other): value, ..., None: value of all others}``, with names of
+        friction: see ``Contact``, for all; or by pairs, ``{(one, other): value, ..., None: value of all others}``, with names of
             bodies, or parts of facets or of cells, or one of the rigid surfaces, and values of one law. The first matching pair is
             used; pairs that are not listed are frictionless unless the key ``None`` gives a default.
-        coupling: ``"node_to_surface"``, or ``"mortar"``, for a few bodies on meshes that do not match: each body is then a target of its
-            own that all others are compared with. No body touches itself.
-        normals: ``"facet"`` or ``"averaged"``, as of ``Contact``; at sharp edges they are the facets' own.
-        max_penetration: bound on overlaps at the start, a length; None is 5 % of the smallest body's size.
-        measure: as of ``Contact``.
+        coupling: ``"node_to_surface"``, or ``"mortar"``, for a few bodies with non-matching meshes: each body is then a separate
+            target, compared with all others. There is no self-contact.
+        normals: ``"facet"`` or ``"averaged"``, see ``Contact``; at sharp edges they are the facets' own.
+        max_penetration: bound on the initial penetration, a length; None is 5 % of the smallest body's size.
+        measure: see ``Contact``.
         name: for messages and files.
-        heat: as of ``Contact``: heat that passes where surfaces touch; with a ``temperature`` through rigid surfaces, too. Or a list.
+        heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
 
     Raises:
         InputError, InputTypeError: for an unknown word, or numbers out of their range.
@@ -116,7 +116,7 @@ class GeneralContact(OfProblem, given.Sealed):
         self._parts, self._fields = list[Contact](), dict[str, fem.Function]()
 
     def _friction_of_pairs(self, friction: Any) -> FrictionOfPairs | None:
-        """Friction that is given by pairs; None if it is one for all."""
+        """Friction by pairs of bodies; None if all surfaces have the same."""
         if not isinstance(friction, dict):
             given_friction(friction)
             return None
@@ -129,15 +129,15 @@ class GeneralContact(OfProblem, given.Sealed):
         return pairs
 
     def __repr__(self) -> str:
-        """Its name, and how many rigid surfaces it has."""
+        """Name and number of rigid surfaces."""
         return f"GeneralContact({self.name!r}, rigid surfaces: {len(self.rigid)})"
 
     def make_parts(self, config: Configuration, others: Sequence[Contact], rigid: Bools | None = None) -> list[Contact]:
-        """The single contacts of the general contact, in a problem with these ``others`` and ``rigid (n_owned,)`` nodes (collective).
+        """Make the single contacts of the general contact, in a problem with these ``others`` and ``rigid (n_owned,)`` nodes (collective).
 
         Raises:
-            TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets within a body.
-            SurfaceError: if nothing is left that may touch, or a body has two names, or two bodies have one.
+            TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets inside a body.
+            SurfaceError: if no surfaces are left that may touch, if a body has two names, or if two bodies have the same name.
         """
         from uem_dolfinx.geometry.skin import Skin
 
@@ -167,7 +167,7 @@ class GeneralContact(OfProblem, given.Sealed):
         if len(with_facets) > 1 or itself.any():
             apart: list[Apart] = [(*where(skin, one, "exclude"), *where(skin, other, "exclude")) for one, other in pairs]
             if self.coupling != "mortar":
-                # nodes at the border of what is tied are tied: they touch nothing beside it
+                # nodes at the border of a tied surface are tied: they touch no neighbouring facets
                 tied = [False] * (len(pairs) - len(others)) + [c.tied is True for c in others]
                 apart = [with_border(skin, sets) if of_tie else sets for sets, of_tie in zip(apart, tied)]
             among = self._mortar if self.coupling == "mortar" else self._nodes
@@ -185,7 +185,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return parts
 
     def _refuse_open_conductance(self, config: Configuration, bound: float) -> None:
-        """Raise InputError for heat that passes through gaps: what is farther than a facet is not looked at (collective)."""
+        """Raise InputError for heat flow through gaps, since only facets within reach are searched (collective)."""
         gaps = bound * np.array([1.0, 1e-2, 1e-4])
         for law in self.heats:
             open_ = law.conductances(config.comm, self.name, np.zeros(3), gaps, np.zeros(3, bool))
@@ -199,13 +199,13 @@ class GeneralContact(OfProblem, given.Sealed):
     def _nodes(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]
     ) -> list[Contact]:
-        """Contacts of nodes with bodies (collective); arguments as those of ``Neighbours``, ``nodes`` are all on the surfaces."""
+        """Contacts of nodes with bodies (collective); arguments as for ``Neighbours``, but ``nodes`` are all nodes of the surfaces."""
         from uem_dolfinx.geometry.neighbours import Neighbours
 
         skin = self._skin
         body = skin.body_of_node[nodes]
         own = nodes[(place[body] < place[skin.size > 0].max()) | itself[body] | skin.corners[nodes]]
-        # as many bodies as others meet one in a corner of a grid of blocks
+        # as many bodies as meet another one at a corner in a grid of blocks
         n_lists = 2**self._config.gdim - 1
         neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
         together: list[AmongContact] = []
@@ -216,7 +216,7 @@ class GeneralContact(OfProblem, given.Sealed):
     def _mortar(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]
     ) -> list[Contact]:
-        """Contacts of facets with each body that others follow (collective); arguments as of ``_nodes``."""
+        """Mortar contacts with each target body (collective); arguments as for ``_nodes``."""
         from uem_dolfinx.contact.general.mortar import Body
         from uem_dolfinx.geometry.faces import classes_of_facets, facets_by_class, surface_of
 
@@ -230,11 +230,11 @@ class GeneralContact(OfProblem, given.Sealed):
         return found
 
     def _name(self, k: int) -> str:
-        """Of the k-th of the contacts between bodies."""
+        """Name of the k-th contact between bodies."""
         return f"{self.name} {k + 1}" if k else self.name
 
     def _give_friction(self, parts: Sequence[Contact]) -> None:
-        """Tell the contacts what friction pairs have (collective)."""
+        """Set the friction of pairs in the contacts (collective)."""
         from uem_dolfinx.contact.general.pair_friction import ValuesOfPairs
 
         assert self._pairs is not None
@@ -257,7 +257,7 @@ class GeneralContact(OfProblem, given.Sealed):
 
     @property
     def all_surfaces(self) -> Tag:
-        """Facets that may touch something, once a problem has been made."""
+        """Facets that may touch others, once a problem has been made."""
         return self._skin.tag
 
     # -- results ---------------------------------------------------------------------------------------------------------
@@ -271,7 +271,7 @@ class GeneralContact(OfProblem, given.Sealed):
 
     @property
     def n_active(self) -> int:
-        """Number of active contactors over all ranks, of a node as many as it touches bodies (collective)."""
+        """Number of active contactors over all ranks; a node counts once for each body that it touches (collective)."""
         return sum(part.n_active for part in self.parts)
 
     def max_gap(self) -> float:
@@ -284,14 +284,14 @@ class GeneralContact(OfProblem, given.Sealed):
 
     @property
     def pressure(self) -> fem.Function:
-        """Contact pressure as a scalar field on contactors, the sum where they touch several bodies (collective)."""
+        """Contact pressure as a scalar field on contactors, summed over all touched bodies (collective)."""
         return self._sum("pressure")
 
     def pressure_to_integrate(self) -> fem.Function:
-        """Normal forces per reference area, whose integral over surfaces in contact is their sum; see ``Contact`` (collective).
+        """Normal forces per reference area; the integral over surfaces in contact is their sum; see ``Contact`` (collective).
 
-        Of two surfaces that touch the nodes of one follow, and nodes at sharp edges of both: integrate over the facets of both that face
-        each other.
+        Contactors are the nodes of one surface, and nodes at sharp edges of both: integrate over the facets of both that face each
+        other.
         """
         return self._together("pressure_to_integrate", [part.pressure_to_integrate() for part in self.parts], np.add)
 
@@ -307,25 +307,25 @@ class GeneralContact(OfProblem, given.Sealed):
 
     @property
     def heat_flux(self) -> fem.Function:
-        """Power per area that goes from contactors to what they touch, as a scalar field; 0 without ``heat`` (collective).
+        """Power per area from contactors to touched surfaces, as a scalar field; 0 without ``heat`` (collective).
 
-        Of several conductances it is that of the first one's field.
+        With several conductances, it belongs to the field of the first one.
         """
         return self.heat_flux_of(self.heats[0].field) if self.heats else self._sum("heat_flux")
 
     def heat_flux_of(self, field: int) -> fem.Function:
-        """The same of a field; see ``Contact.heat_flux_of`` (collective)."""
+        """The heat flux of a given field; see ``Contact.heat_flux_of`` (collective)."""
         field = one_of_fields(self.name, self.heats, field)
         what = "heat_flux" if field == self.heats[0].field else f"heat_flux_of_field_{field}"
         return self._together(what, [part.flux_of_part(field) for part in self.parts], np.add)
 
     def heat_balance(self) -> float:
-        """Heat summed over all bodies over the sum of its nodal sizes, the largest of all contacts between bodies (collective)."""
+        """Sum of nodal heat over the sum of its absolute values, the largest of all contacts between bodies (collective)."""
         return max([part.heat_balance() for part in self.parts if part.pair.target.n_nodes], default=0.0)
 
     @property
     def gap(self) -> fem.Function:
-        """The least gap as a scalar field, a length; as large as the model where nothing is near, zero off the surfaces (collective)."""
+        """The least gap as a scalar field, a length; the model's size if no surface is near, zero off the surfaces (collective)."""
         return self._of_all("gap", np.minimum)
 
     def resultant(self, about: npt.ArrayLike | None = None) -> Resultant:
@@ -345,7 +345,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return self._of_all(what, np.add)
 
     def _of_all(self, what: str, together: np.ufunc) -> fem.Function:
-        """A field of all parts together (collective)."""
+        """A field combined over all parts (collective)."""
         return self._together(what, [getattr(part, what) for part in self.parts], together)
 
     def _together(self, what: str, fields: list[fem.Function], together: np.ufunc) -> fem.Function:
@@ -359,7 +359,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return [touch for touch, _ in self.forces_of_pairs()]
 
     def forces_of_pairs(self, about: npt.ArrayLike | None = None) -> list[tuple[Touch, Array]]:
-        """The pairs of ``touching``, each with the moment on the first, a vector, in 2D ``(1,)`` (collective).
+        """The pairs of ``touching``, each with the moment on the first body, ``(3,)`` or in 2D ``(1,)`` (collective).
 
         Args:
             about: point that moments are taken about ``(gdim,)``; None is the origin.
@@ -378,7 +378,7 @@ class GeneralContact(OfProblem, given.Sealed):
 
         Args:
             first: name of the body.
-            second: name of the other body, or of a rigid surface as in ``touching``; None is all bodies and surfaces in contact.
+            second: name of the other body, or of a rigid surface as in ``touching``; None sums over all bodies and surfaces in contact.
             about: point that the moment is taken about ``(gdim,)``; None is the origin.
 
         Raises:
@@ -387,15 +387,15 @@ class GeneralContact(OfProblem, given.Sealed):
         return self._between(first, second, about)[0]
 
     def heat_power(self, first: str, second: str | None = None, field: int | None = None) -> float:
-        """Power that goes from a body to another one or to a rigid surface, the heat of friction aside (collective).
+        """Power that flows from a body to another one or to a rigid surface, without frictional heat (collective).
 
         Args:
-            first: as of ``between``.
-            second: likewise.
-            field: of which field, by all of its conductances together; None is the first one's.
+            first: see ``between``.
+            second: see ``between``.
+            field: number of the field, summed over its conductances; None is the field of the first conductance.
 
         Raises:
-            InputError: for an unknown name, or if no conductance is of that field.
+            InputError: for an unknown name, or if no conductance belongs to that field.
         """
         of = None if field is None else one_of_fields(self.name, self.heats, field)
         return self._between(first, second, None, of)[1]
@@ -406,14 +406,14 @@ class GeneralContact(OfProblem, given.Sealed):
         return between(self._sums_of_pairs(about, field), names, first, second, sum_up(self._config.comm, none, none))
 
     def _rigid_name(self, part: Contact) -> str:
-        """What ``touching`` calls the rigid surface of one of the contacts."""
+        """Name of a contact's rigid surface in ``touching``."""
         return part.name.removeprefix(f"{self.name} on ")
 
 
 def parts_of(
     contacts: Sequence[Contact | GeneralContact], config: Configuration, couplings: Sequence[RigidCoupling] = ()
 ) -> list[Contact]:
-    """Contacts with general ones taken apart, in a problem with these couplings (collective)."""
+    """Contacts, with general contacts replaced by their parts, in a problem with these couplings (collective)."""
     single, rigid = [one for one in contacts if isinstance(one, Contact)], np.zeros(config.n_owned, bool)
     for coupling in couplings if len(single) < len(contacts) else ():
         coupling.mark(config, rigid)

@@ -1,6 +1,6 @@
-"""The interface of one contact: contactors, what ties them to their target, and the law they follow. It places, decides and commits.
+"""The interface of one contact: contactors, their discretisation and friction. It places contactors, updates the active set and commits.
 
-It keeps a trial state that changes with every iteration and a committed one that changes only after convergence.
+The trial state changes in every iteration, the committed state only after convergence.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ class Interface(Told):
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
-        discretisation: what ties them to their target.
-        friction: what it adds along the target; None without.
-        tie: what ties contactors for good, beside contact; None without.
+        discretisation: relates them to their target.
+        friction: tangential part; None without friction.
+        tie: permanent tie of contactors, in addition to contact; None without a tie.
         name: for messages.
         sliding: ``"finite"``, ``"small"`` or ``"fixed"``.
         max_penetration: bound on the initial penetration, a length.
-        thickness: of the target's body, a length.
+        thickness: thickness of the target's body, a length.
 
     Attributes:
         trial: state of the present iteration.
         committed: state of the last step.
-        kinematics: of the contactors, for the trial state; known after ``project``.
+        kinematics: of the contactors, for the trial state; available after ``project``.
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         redundant: active contactors whose equations depend on others and were left out ``(n,)``.
         reserved: contactors that have rows in the sparsity of P ``(n,)``.
-        mutual: whether contactor and target follow each other (two-pass).
-        heats: what passes through, one of every conductance.
+        mutual: whether contactors and target follow each other (two-pass).
+        heats: heat flow, one object per conductance.
     """
 
     kinematics: Kinematics
@@ -88,10 +88,10 @@ class Interface(Told):
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
     def project(self) -> None:
-        """Project the contactors onto the target where both are now (collective).
+        """Project the contactors onto the target in the current configuration (collective).
 
         Raises:
-            NotFiniteError: if the target's functions return what is not finite.
+            NotFiniteError: if the target's functions return values that are not finite.
         """
         if self.asked or not self.far:
             self._project()
@@ -125,15 +125,15 @@ class Interface(Told):
             self.friction.place(self.kinematics, self.trial.friction)
 
     def _replace(self, kinematics: Kinematics) -> None:
-        """Take other kinematics at the same displacement (collective)."""
-        # values that are the same on one rank are so on all
+        """Replace the kinematics at the same displacement (collective)."""
+        # objects are identical on all ranks or on none
         if kinematics is not self.kinematics:
             self.kinematics = kinematics
             if self.friction is not None:
                 self.friction.replace(kinematics)
 
     def look(self) -> None:
-        """Place contactors that were not looked at since the surfaces are far apart (collective)."""
+        """Project contactors that were skipped because the surfaces are separated (collective)."""
         if self.far:
             self.far = False
             self.project()
@@ -145,45 +145,45 @@ class Interface(Told):
             correction = self.kinematics.gap_rows.normal_return(self.trial.active)
         if self.friction is not None:
             correction = correction + self.friction.return_vectors(self.trial)
-        # surfaces that follow each other would both make up for the same gap
+        # surfaces that follow each other would both close the same gap
         correction[(np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size) | self.mutual] = 0.0
         return correction
 
     # -- activation and release ------------------------------------------------------------------------------------------
 
     def set_friction(self, law: FrictionLaw, value: Array) -> None:
-        """Take a law of friction, and other values of its parameter ``(n,)``, between two steps (collective)."""
+        """Set a friction law and values of its parameter ``(n,)``, between two steps (collective)."""
         assert self.friction is not None
         self.trial = self.committed = self.friction.other_law(self.committed, law, value)
 
     def _set_active(self, state: PairState) -> None:
-        """Take over a state with another active set."""
+        """Set the trial state, with another active set."""
         self.trial = state if self.friction is None else self.friction.come_and_go(state, self.trial.active)
 
     def activate_touching(self) -> None:
-        """Start with the contactors that touch without force as active, where they stick (collective)."""
+        """Activate contactors that initially touch without force; with friction they stick (collective)."""
         anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
         state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
         self._set_active(replace(state, at_end=self._at_end(self.trial)))
         if anchored is not None and self.trial.friction is not None:
             self.trial = replace(self.trial, friction=replace(anchored, stick=self.trial.friction.stick))
-        # a first step that fails and is cut starts from here again
+        # a first step that fails and is cut starts again from this state
         self.committed = self.trial
         if anchored is not None:
             self.project()
 
     def bar_returned(self) -> int:
-        """Leave out contactors that had passed the end of the target, sunk, and are taken back in this step: how many (collective)."""
+        """Exclude contactors that had sunk past the target's end and re-entered in this step; return their number (collective)."""
         came = self.trial.active & ~self.committed.active & self.committed.passed
         self.committed = replace(self.committed, barred=self.committed.barred | came)
         return int(reduced(self.config.comm, int(came.sum())))
 
     def _at_end(self, state: PairState) -> Bools:
-        """Contactors that an end of the target holds in the next step ``(n,)``: where surfaces follow each other, the end touches."""
+        """Contactors held by an end of the target in the next step ``(n,)``; none with two-pass contact, where the end itself touches."""
         return self.kinematics.ends.held(state) & np.logical_not(self.mutual)
 
     def follow(self) -> bool:
-        """Let go of contactors past an end, follow the others from facet to facet (collective): whether any equation changes here."""
+        """Release contactors past an end, follow the others from facet to facet (collective): whether an equation changes on this rank."""
         off = self.off
         gone = bool((self.trial.active & off).any())
         self.kinematics, state, moved = self.kinematics.follow(slide_off(self.trial, off))
@@ -191,7 +191,7 @@ class Interface(Told):
         return gone or moved
 
     def predicted(self, du: Array) -> Array:
-        """Gaps that decide on contact, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
+        """Deciding gaps, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
         return self.kinematics.gap_rows.gaps(du)
 
     def violated(
@@ -204,23 +204,23 @@ class Interface(Told):
         swept: bool,
         du: Array | None = None,
     ) -> active_set.Violations:
-        """Contactors that break the conditions of contact with such gaps and forces (collective).
+        """Contactors whose gaps and forces violate the contact conditions (collective).
 
         Args:
-            gap: that decides on contact ``(n,)``.
-            seen: contact forces, here or predicted.
+            gap: deciding gaps ``(n,)``.
+            seen: contact forces, current or predicted.
             stiffness: of the contactors along the normal ``(n,)``.
-            force_rounding: forces below it are zero ``(n,)``.
-            gap_rounding: gaps below it are zero, and below rounding of positions.
-            swept: leave out those that have slid off a thin target, which sweeps past them on the way to equilibrium.
-            du: increment of the owned nodes with which they are predicted ``(n_owned, gdim)``; None where the bodies are now.
+            force_rounding: smaller forces count as zero ``(n,)``.
+            gap_rounding: smaller gaps count as zero, as do gaps below the rounding of positions.
+            swept: skip contactors that have slid off a thin target, since it may sweep past them during the iteration.
+            du: increment of the owned nodes used for the prediction ``(n_owned, gdim)``; None for the current configuration.
         """
         off = self.off
         if swept and self.thickness < np.inf:
             off = off | (self.trial.at_end & self.trial.passed)
-        # an equation that was left out as dependent and does not hold is no contact
+        # a contactor is open if its equation was dropped as redundant and its gap is positive
         apart = self.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
-        # the facets of a corner are let go of one by one, which ``follow`` does
+        # ``follow`` releases the facets of a corner one by one
         pulled = np.where(self.trial.in_corner, 0.0, seen.lam)
         rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
         violated = active_set.find_violations(
@@ -231,7 +231,7 @@ class Interface(Told):
         return self.friction.violated(violated, self.trial, seen, stiffness, (force_rounding, rounding), du)
 
     def exchange(self, violated: active_set.Violations, ahead: bool) -> bool:
-        """Let wrong contactors change sides, and those that are to follow them if ``ahead`` (collective): whether there are any."""
+        """Change the status of violated contactors, with ``ahead`` also of those next to slip: whether there are any (collective)."""
 
         def enter(state: PairState) -> PairState:
             self.trial = state
@@ -245,7 +245,7 @@ class Interface(Told):
         return led
 
     def calm(self, which: Bools) -> bool:
-        """Give those of contactors ``which (n,)`` that bends lead to and fro averaged normals in this step: whether any gets them."""
+        """Set averaged normals in this step for contactors of ``which (n,)`` that alternate between facets: whether there are any."""
         from uem_dolfinx.contact.nodes.concave_edges import HOLD_AFTER, MOST_CHANGES
 
         changes = self.trial.changes
@@ -254,7 +254,7 @@ class Interface(Told):
         return bool(some.any())
 
     def meet(self, others: Sequence[Interface]) -> None:
-        """Take what other contacts with rigid surfaces do to the same contactors (collective)."""
+        """Take the normals of other contacts with rigid surfaces at the same contactors (collective)."""
         if self.friction is None:
             return
         normals = np.zeros((len(self.nodes), len(others), self.config.gdim))
@@ -264,7 +264,7 @@ class Interface(Told):
         self.friction.meet(self.kinematics, normals)
 
     def place_again(self) -> None:
-        """Put contactors whose equations have changed where they now belong (collective)."""
+        """Place contactors again if their equations have changed (collective)."""
         self._replace(self.kinematics.placed_again(self.trial))
 
     # -- bodies that only contact holds ----------------------------------------------------------------------------------
@@ -276,12 +276,12 @@ class Interface(Told):
 
     @property
     def approach(self) -> UnitingEquations:
-        """The equations that inactive contactors in front of the target would have if they were active."""
+        """Normal equations of inactive contactors in front of the target."""
         rows = self.kinematics.gap_rows.select(self._ahead, np.ones(len(self.nodes), bool))
         return rows.test.select(rows.kind == NORMAL)
 
     def activate_closing(self, closing: Bools) -> bool:
-        """Activate the contactors among those of ``approach`` that close and touch (collective): whether there are any."""
+        """Activate the contactors of ``approach`` that are ``closing`` and touch (collective): whether there are any."""
         i = self._ahead
         now = i[closing & (self.gap[i] <= active_set.TOUCHING * self.config.size)]
         active = self.trial.active.copy()
@@ -290,7 +290,7 @@ class Interface(Told):
         return bool(reduced(self.config.comm, len(now)))
 
     def release_apart(self) -> None:
-        """Release contactors without friction that rigid motions have taken off their target (collective)."""
+        """Without friction, release contactors that rigid motions have separated from the target (collective)."""
         if not self.frictional:
             apart = self.trial.active & (self.gap > active_set.TOUCHING * self.config.size)
             self._set_active(replace(self.trial, active=self.trial.active & ~apart))
@@ -298,9 +298,9 @@ class Interface(Told):
     # -- what the united system gets -------------------------------------------------------------------------------------
 
     def equations(self) -> Constraints:
-        """Uniting equations of the contactors that are or may become active, then of those that are tied (collective).
+        """Equations of the contactors that are or may become active, then of tied contactors (collective).
 
-        Those near the target have rows, found anew when an active one lacks its own; those that touch first alone until others follow.
+        Contactors near the target have rows; this set is renewed when an active contactor has no row. At first touch, it is the active set.
         """
         lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
         if lacks:
@@ -311,7 +311,7 @@ class Interface(Told):
         return own if self.tie is None else self.tie.join(own)
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
-        """Take which of the equations ``(m,)`` depend on others and were left out."""
+        """Set which of the equations ``(m,)`` are redundant and were dropped."""
         if self.tie is not None:
             self.tie.set_redundant(equations, redundant)
         equations, redundant = equations.contact, redundant[: len(equations.contact)]
@@ -324,7 +324,7 @@ class Interface(Told):
     def forces(self, equations: Constraints, multipliers: Array, du: Array | None = None) -> Traction:
         """Contact forces from the multipliers of the equations ``(m,)`` (collective).
 
-        ``du (n_owned, gdim)`` is the increment that they are predicted with; None where the bodies are now.
+        ``du (n_owned, gdim)`` is the increment used for the prediction; None for the current configuration.
         """
         contact = equations.contact
         of, trial, kinematics = multipliers[: len(contact)], self.trial, self.kinematics
@@ -340,24 +340,24 @@ class Interface(Told):
         return own(state) if self.tie is None else self.tie.nodal_forces(state, own)
 
     def with_forces(self, found: Traction) -> PairState:
-        """The trial state with contact forces that were read or predicted."""
+        """The trial state with computed or predicted contact forces."""
         state = replace(self.trial, lam=found.lam, nodal=found.nodal, force=found.force, heat=found.heat, bond=found.bond)
         if state.friction is None or found.tau is None:
             return state
         return replace(state, friction=replace(state.friction, tau=found.tau))
 
     def set_forces(self, found: Traction, active: Bools | None = None) -> None:
-        """Give the trial state contact forces, and an active set ``(n,)`` if another method than elimination decides on it."""
+        """Set contact forces of the trial state, and the active set ``(n,)`` if a method other than elimination decides on it."""
         state = self.with_forces(found)
         self.trial = state if active is None else replace(state, active=active)
 
     @property
     def has_known_forces(self) -> bool:
-        """Whether friction of contactors of this rank may not grow with the force along the normal."""
+        """Whether friction of any contactor of this rank may be independent of the normal force."""
         return self.friction is not None and self.friction.has_known_forces(self.trial)
 
     def known_forces(self) -> tuple[Ints, Array]:
-        """Forces of friction that do not grow with the force along the normal: nodes ``(k,)``, forces ``(k, gdim)`` (collective)."""
+        """Friction forces independent of the normal force: nodes ``(k,)``, forces ``(k, gdim)`` (collective)."""
         assert self.friction is not None
         return self.friction.known_forces(self.trial, self.kinematics)
 
@@ -369,25 +369,25 @@ class Interface(Told):
         return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
     def turn(self, stiffness: Array) -> None:
-        """Take the directions of friction from where the contactors are; ``stiffness (n_owned, gdim)``: diagonal of K (collective)."""
+        """Update the slip directions from the current positions; ``stiffness (n_owned, gdim)``: diagonal of K (collective)."""
         if self.friction is not None:
             self.trial = self.friction.turn(self.trial, self.kinematics, stiffness)
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
-        """What sliding friction adds to tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
+        """Terms of sliding friction in tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
         return None if self.friction is None else self.friction.slip_terms(self.trial, self.kinematics)
 
     # -- trial and committed ---------------------------------------------------------------------------------------------
 
     def unite(self, which: Bools | None = None) -> None:
-        """Tie contactors to the target for good, between two steps, as of ``Tie``; to be followed by ``project`` (collective)."""
+        """Tie contactors to the target permanently, between two steps, see ``Tie``; call ``project`` afterwards (collective)."""
         assert self.tie is not None
         self.committed = self.tie.unite(self.committed, self.projection, self._past_end, which)
         self._reserved, self._redundant = self.reserved & ~self.tied, self.redundant
         self.restore()
 
     def commit(self) -> None:
-        """Make the trial state the committed one; to be followed by ``project``."""
+        """Make the trial state the committed one; call ``project`` afterwards."""
         if self.far:
             return
         if self.friction is not None:
@@ -406,26 +406,26 @@ class Interface(Told):
         self._wear()
 
     def _wear(self) -> None:
-        """Let gaps be larger by what the committed state has worn (collective)."""
+        """Increase gaps by the wear depth of the committed state (collective)."""
         if self.friction is not None and self.friction.wear is not None:
             self.friction.wear.apply(self.committed)
 
     def restore(self) -> None:
-        """Go back to the committed state; to be followed by ``project``."""
+        """Go back to the committed state; call ``project`` afterwards."""
         self.trial = self.committed
         self.reserved, self.redundant = self._reserved, self._redundant
         if self.tie is not None:
             self.tie.lose()
 
     def memory(self) -> tuple[PairState, Bools, Bools]:
-        """What the next step begins with, the displacement aside."""
+        """The state with which the next step begins, without the displacement."""
         return self.committed, self.reserved, self.redundant
 
     def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
-        """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
+        """Restore a state from ``memory``; call ``project`` afterwards, with bodies and target at their positions of that time."""
         self.committed, self.reserved, self.redundant = memory
         if self.tie is not None:
-            # what has been tied since then stays so
+            # contactors that have been tied since then remain tied
             self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied
         self._reserved, self._redundant = self.reserved, self.redundant
         self.discretisation.commit()
@@ -435,7 +435,7 @@ class Interface(Told):
         self._wear()
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what ``to_checkpoint`` returned, to be followed by ``project`` (collective)."""
+        """Restore a state from ``to_checkpoint``; call ``project`` afterwards (collective)."""
         if self.tie is not None:
             self.tie.from_checkpoint(kept, self._past_end)
         reserved, redundant = (np.array(kept[name]) for name in ("reserved", "redundant"))
@@ -443,5 +443,5 @@ class Interface(Told):
 
 
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:
-    """Pairs of which any rank has a contactor in question; the others have no part in an iteration, but for their placement."""
+    """Pairs with a contactor near the target on any rank; in an iteration, the other pairs are only placed."""
     return [pair for pair in pairs if pair.asked]

@@ -1,7 +1,7 @@
-"""What ties contactors of an interface to the target for good: from the start, or from a given step on.
+"""Permanent tie of an interface's contactors to the target, from the start or from a given step on.
 
-What is tied has equations of ``tied_rows`` in all components, and no part in contact. What is not, because it was too far away or did
-not touch when the others were tied, goes on as contact does.
+Tied contactors have equations of ``tied_rows`` in all components, and no contact conditions. Contactors that were out of reach or
+open at the time of tying remain in contact.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from uem_dolfinx.parallel import agree, reduced
 
 @dataclass(frozen=True)
 class TiedConstraints(Constraints):
-    """``Constraints`` of contactors that touch, and after them those of contactors that are tied.
+    """``Constraints`` of contactors in contact, followed by those of tied contactors.
 
     Attributes:
-        first: those of contactors that touch.
+        first: constraints of contactors in contact.
     """
 
     first: Constraints
@@ -50,7 +50,7 @@ class TiedConstraints(Constraints):
 
     @classmethod
     def join(cls, contact: Constraints, tied: UnitingEquations, contactor: Ints, kind: Ints) -> TiedConstraints:
-        """Both, the tied ones of these contactors and components ``(m,)``."""
+        """Join both; ``contactor`` and ``kind`` are contactors and components of the tied equations ``(m,)``."""
         g, made = tied.direction.shape[1], dict[int, UnitingEquations]()
         lists = [contact.trial, contact.test, contact.frictionless, contact.resisting, contact.stopping]
         for own in lists:
@@ -62,23 +62,23 @@ class TiedConstraints(Constraints):
 
 
 class Tie:
-    """What ties contactors of one interface to the target.
+    """Permanent tie of contactors of one interface to the target.
 
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         discretisation: of the interface.
         name: for messages.
-        sliding: as of ``Interface``.
-        max_penetration: likewise.
-        means: discretisation by which means are found when contactors are tied, which serves nothing else; None ties nodes.
-        reach: contactors that are tied at the start are no farther from the target, a length; None is a side of its facet.
+        sliding: see ``Interface``.
+        max_penetration: see ``Interface``.
+        means: separate mortar discretisation for weighted means at the time of tying; None ties nodes.
+        reach: largest distance from the target of contactors tied at the start, a length; None is a side of the target's facet.
 
     Attributes:
         means: as given.
-        rows: of what is tied; None before.
-        tied: contactors that are united with the target in all components ``(n,)``.
-        whole: whether no contactor is left for contact, on any rank.
+        rows: equations of tied contactors; None before tying.
+        tied: contactors tied to the target in all components ``(n,)``.
+        whole: whether no rank has contactors left for contact.
         at: displacement at which they were tied.
     """
 
@@ -101,28 +101,28 @@ class Tie:
         self.tied: Bools = np.zeros(len(nodes), dtype=bool)
         self.whole = False
         self.at = fem.Function(config.V, name="tied_at")
-        #: Components whose equations depend on others and were left out ``(n, gdim)``.
+        #: Components whose equations are redundant and were dropped ``(n, gdim)``.
         self._left_out: Bools = np.zeros((len(nodes), config.gdim), dtype=bool)
-        #: Equations where the bodies have been placed last, and whether a placement is to find contactors again that no contact needs.
+        #: Equations of the last placement, and whether the next one projects all contactors, even if contact needs none of them.
         self._here: UnitingEquations | None = None
         self._lost = True
 
     # -- tying -----------------------------------------------------------------------------------------------------------
 
     def unite(self, state: PairState, projection: Projection, off: Bools, which: Bools | None = None) -> PairState:
-        """Tie contactors where they are now: those within reach, or ``which (n,)`` (collective).
+        """Tie contactors at their current positions: all within reach, or ``which (n,)`` (collective).
 
         Args:
-            state: committed so far.
+            state: committed state.
             projection: of the contactors.
             off: contactors that have slid past an end of the target ``(n,)``.
             which: contactors to be tied ``(n,)``.
 
         Returns:
-            The committed state, in which what is tied is in no contact and keeps its forces.
+            The committed state, in which tied contactors have no contact conditions and keep their forces.
 
         Raises:
-            SurfaceError: if there are none.
+            SurfaceError: if no contactor is tied.
         """
         drag = 0.0 if state.friction is None else state.friction.tau
         forces = state.lam[:, None] * projection.normal + drag if self.means else state.force
@@ -145,13 +145,13 @@ class Tie:
         return self.config.X[self.nodes] + self.config.displacement[self.nodes]
 
     def untie(self) -> None:
-        """Tie nothing any more; to be followed by ``remember`` and ``project``."""
+        """Release all tied contactors; call ``remember`` and ``project`` afterwards."""
         self.rows, self.tied, self._here, self._lost, self.whole = None, np.zeros(len(self.nodes), dtype=bool), None, True, False
         self._left_out = np.zeros_like(self._left_out)
 
     @property
     def knows_conditions(self) -> bool:
-        """Whether its rows belong to the Dirichlet conditions that there were when they were made."""
+        """Whether its rows depend on the Dirichlet conditions at the time of tying."""
         return self.means is not None
 
     def followed_by_ties(self) -> Ints:
@@ -159,14 +159,14 @@ class Tie:
         return np.zeros(0, np.int64) if self.rows is None else self._equations().followed
 
     def _within_reach(self, state: PairState) -> Bools:
-        """Contactors near enough to the target to be tied ``(n,)`` (collective)."""
+        """Contactors within reach of the target ``(n,)`` (collective)."""
         p = self.target.project(self._points)
         reach = p.facet_size if self.target.n_nodes else self.max_penetration
         near = np.abs(p.gap) <= (reach if self._reach is None else self._reach)
         return np.asarray(near if self.means else near & ~Ends(p, np.inf).past(state))
 
     def _make(self, which: Bools, off: Bools) -> None:
-        """Rows of contactors ``which (n,)`` where they were at the displacement ``at``, or are on a rigid target (collective)."""
+        """Make rows of contactors ``which (n,)`` at the displacement ``at``, or at the current one for a rigid target (collective)."""
         config, nodes, kept = self.config, self.nodes, self.sliding != "finite"
         if not self.target.n_nodes:
             self._take_rows(to_surface(config, nodes, self.target, which), off)
@@ -183,12 +183,12 @@ class Tie:
         self._take_rows(rows, off)
 
     def _take_rows(self, rows: TiedRows, off: Bools) -> None:
-        """Take the rows; ``off (n,)`` as of ``unite`` (collective)."""
+        """Set the rows; ``off (n,)`` as in ``unite`` (collective)."""
         self.rows, self.tied, self._here, self._lost = rows, np.asarray(rows.has.any(axis=1)), None, True
         self.whole = not reduced(self.config.comm, int((~self.tied & ~off).sum()))
 
     def untouched(self, state: PairState) -> PairState:
-        """The state in which nothing that is tied is in contact."""
+        """The state without contact at tied contactors."""
         tied, f = self.tied, state.friction
         if f is not None:
             f = replace(f, stick=f.stick & ~tied, tau=np.where(tied[:, None], 0.0, f.tau))
@@ -198,7 +198,7 @@ class Tie:
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
     def begin_placement(self) -> bool:
-        """The bodies have moved: whether contactors are to be projected; of tied ones that is done once a step, to be told."""
+        """Bodies have moved: whether contactors must be projected. If all are tied, this is done once a step, for results."""
         self._here, search = None, self._lost or not self.whole
         self._lost = False
         return search
@@ -213,18 +213,18 @@ class Tie:
         return self.tied
 
     def _equations(self) -> UnitingEquations:
-        """Of what is tied, where the bodies are now (collective)."""
+        """Equations of tied contactors in the current configuration (collective)."""
         assert self.rows is not None
         if self._here is None:
             self._here = self.rows.equations(self.target.motion)
         return self._here
 
     def largest_gap_here(self) -> float:
-        """Largest component of the way from where a contactor of this rank is tied, a length."""
+        """Largest component of the violation of this rank's tie equations, a length."""
         return float(np.abs(np.where(self._left_out, 0.0, self.apart())).max(initial=0.0))
 
     def apart(self) -> Array:
-        """How far tied contactors are from where they are tied ``(n, gdim)``; known where the equations have been asked for."""
+        """Distance of tied contactors from their tied positions ``(n, gdim)``; zero before the equations have been made."""
         way = np.zeros(self._left_out.shape)
         if self.rows is not None and self._here is not None:
             way[self.rows.has] = self._here.gap
@@ -242,23 +242,23 @@ class Tie:
     # -- what the united system gets -------------------------------------------------------------------------------------
 
     def join(self, contact: Constraints) -> Constraints:
-        """Equations of contact, and after them those of what is tied (collective)."""
+        """Equations of contact, followed by those of tied contactors (collective)."""
         return contact if self.rows is None else TiedConstraints.join(contact, *self._uniting())
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
-        """Equations that unite what is tied, their contactors and components ``(m,)`` (collective)."""
+        """Equations of tied contactors, with their contactors and components ``(m,)`` (collective)."""
         assert self.rows is not None
         i, c = np.nonzero(self.rows.has)
         return self._equations(), i, c
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
-        """Take which of the equations ``(m,)`` depend on others and were left out."""
+        """Set which of the equations ``(m,)`` are redundant and were dropped."""
         k = len(equations.contact)
         self._left_out = np.zeros_like(self._left_out)
         self._left_out[equations.contactor[k:], equations.kind[k:]] = redundant[k:]
 
     def with_forces(self, contact: Traction, equations: Constraints, multipliers: Array) -> Traction:
-        """Forces of contact, and those of what is tied from the multipliers of all equations ``(m,)`` (collective)."""
+        """Contact forces, and tie forces from the multipliers of all equations ``(m,)`` (collective)."""
         if equations.contact is equations:
             return contact._replace(bond=np.zeros(self._left_out.shape))
         k = len(equations.contact)
@@ -266,7 +266,7 @@ class Tie:
         return contact._replace(force=contact.force + self._on_contactors(bond), bond=bond)
 
     def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
-        """Multipliers of all that is tied ``(n, gdim)``, from those of the equations of ``_uniting (m,)`` (collective)."""
+        """Multipliers of tied contactors ``(n, gdim)``, from those of the equations of ``_uniting (m,)`` (collective)."""
         bond = np.zeros(self._left_out.shape)
         bond[contactor, kind] = multipliers
         return bond
@@ -277,7 +277,7 @@ class Tie:
         return np.asarray(self.config.add_at_owners(*self.rows.handed_on(self._equations(), bond))[self.nodes])
 
     def nodal_forces(self, state: PairState, contact: Callable[[PairState], tuple[Ints, Array]]) -> tuple[Ints, Array]:
-        """Forces at nodes of both bodies as of ``Kinematics``, which is asked for those of ``contact`` (collective)."""
+        """Forces at nodes of both bodies as in ``Kinematics``; ``contact`` returns the contact part (collective)."""
         if self.rows is None or state.bond is None:
             return contact(state)
         nodes, forces = contact(replace(state, force=state.force - self._on_contactors(state.bond)))
@@ -285,17 +285,17 @@ class Tie:
         return np.concatenate([nodes, more[0]]), np.concatenate([forces, more[1]])
 
     def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """As of ``Interface``, of gaps that turn with the target (collective)."""
+        """See ``Interface``; second derivatives of kept gaps that rotate with the target (collective)."""
         return [] if self.rows is None or state.bond is None else self.rows.curvature(state.bond)
 
     @property
     def chained(self) -> bool:
-        """As of ``Told``, because of what is tied."""
+        """See ``Told``; here because of the tie."""
         return False
 
     @property
     def works(self) -> bool:
-        """As of ``Told``, likewise."""
+        """See ``Told``; here because of the tie."""
         return False
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
@@ -305,7 +305,7 @@ class Tie:
     # -- what is told ----------------------------------------------------------------------------------------------------
 
     def pressing(self, state: PairState, n: Array, lam: Array, tau: Array) -> tuple[Array, Array]:
-        """As of ``Told``, from those of contact and normals ``(n, gdim)``: tied contactors are pulled, too (collective)."""
+        """See ``Told``; from contact forces and normals ``(n, gdim)``, with tied contactors, which may be in tension (collective)."""
         if self.rows is None or state.bond is None:
             return lam, tau
         force = state.bond * self.rows.share
@@ -314,7 +314,7 @@ class Tie:
         return np.where(self.tied, along, lam), np.where(self.tied[:, None], force - along[:, None] * n, tau)
 
     def areas(self, areas: Array, reference: Array, found: Array) -> Array:
-        """As of ``Told``, from those of contact ``found (n,)`` (collective)."""
+        """See ``Told``; from the areas of contact ``found (n,)`` (collective)."""
         if self.rows is None:
             return found
         if self.rows.area is None:
@@ -326,12 +326,12 @@ class Tie:
     # -- from step to step -----------------------------------------------------------------------------------------------
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
-        """What is tied, and where on a rigid target, as of ``Interface`` (collective)."""
+        """Tied contactors, and their positions on a rigid target, see ``Interface`` (collective)."""
         held = None if self.rows is None else self.rows.held
         return {"tied": self.tied, "held_at": np.zeros(self._left_out.shape) if held is None else held}
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]], off: Bools) -> None:
-        """Go on from what ``to_checkpoint`` returned; ``at`` has been read before; ``off`` as of ``unite`` (collective)."""
+        """Restore a state from ``to_checkpoint`` after ``at`` has been read; ``off`` as in ``unite`` (collective)."""
         tied = np.array(kept["tied"])
         if reduced(self.config.comm, int(tied.sum())):
             self._make(tied, off)

@@ -1,7 +1,7 @@
-"""Convex corners of a target that enter the contactors' facets: nodes on facets do not see them, so they are looked for and told of.
+"""Detect and warn of convex target corners that penetrate contactor facets, which node-to-surface contact does not prevent.
 
-Between two contactors nothing keeps a target's corner out of the facet. How deep it is in there, times the stiffness of both bodies at
-this place, is force that the contact lacks; beside the contact force it tells how wrong the answer is, whatever the load.
+Between two contactors, no condition keeps a target corner out of the facet. Its depth times the stiffness of both bodies there
+estimates the missing force. The ratio of this force to the contact force measures the error, independent of the load.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ LACKING = 0.1
 
 @dataclass(frozen=True)
 class CornerInside:
-    """Corners of a target inside the contactors' surface.
+    """Corners of a target that penetrate the contactors' surface.
 
     Attributes:
-        place: where the one that is deepest for its facet was drawn, as text.
-        depth: of this one, a length.
-        part: of the facet's size that it is deep.
-        lacking: force that the contact lacks by all of them, over the largest contact force so far.
-        both: whether contactors at corners or ends of their own surface press as well, and would not see facets were they the target.
+        place: reference position of the corner that is deepest relative to its facet, as text.
+        depth: of this corner, a length.
+        part: depth over the size of the facet.
+        lacking: missing force of all corners over the largest contact force so far.
+        both: whether contactors at corners or ends of their own surface are in contact, too, so that swapping the surfaces is no remedy.
     """
 
     place: str
@@ -66,10 +66,10 @@ class CornerInside:
 
 
 class TargetCorners:
-    """The convex corners of targets of contacts, and the contactors' surfaces that they may enter (collective).
+    """Convex corners of targets, and the contactors' surfaces that they may penetrate (collective).
 
     Args:
-        pairs: with equations at nodes, which are treated together.
+        pairs: interfaces with equations at nodes, treated together.
         tags: of the contactors' facets of each.
     """
 
@@ -81,7 +81,7 @@ class TargetCorners:
             if isinstance(pair.target, MeshTarget) and id(pair.target.facets) not in known:
                 known[id(pair.target.facets)] = corner_nodes(config, pair.target.facets)
         own = [known[id(p.target.facets)] if isinstance(p.target, MeshTarget) else np.zeros(0, np.int32) for p in pairs]
-        #: Owned nodes of the targets at corners and ends ``(k,)`` with their contacts, and which contacts have one on any rank.
+        #: Owned nodes of the targets at corners and ends ``(k,)`` with their contacts, and which contacts have such nodes on any rank.
         self.nodes = np.concatenate(own)
         self.label: Ints = np.repeat(np.arange(len(pairs)), [len(nodes) for nodes in own])
         self.some: Bools = np.asarray(reduced(config.comm, np.bincount(self.label, minlength=len(pairs))) > 0)
@@ -105,7 +105,7 @@ class TargetCorners:
     def surface(self) -> tuple[JoinedTarget | None, Ints]:
         """Surfaces of the contactors, and which of these each contact has ``(n_pairs,)``; -1 inside a body (first time: collective).
 
-        That has no outside which a corner could come from.
+        A surface inside a body has no outer side from which a corner could enter.
         """
         found: dict[Any, TargetFacets | None] = {}
         for tag in (tag for tag, some in zip(self._tags, self.some) if some and id(tag) not in found):
@@ -120,11 +120,11 @@ class TargetCorners:
 
     @timed("corners of the target")
     def find(self, stiffness: Array, asked: Bools) -> dict[int, CornerInside]:
-        """The corners that are inside where the bodies are now, of contacts in which they matter, by their numbers (collective).
+        """Penetrating corners in the current configuration, by number of the contact, for contacts in which they matter (collective).
 
         Args:
             stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
-            asked: contacts that are looked at ``(n_pairs,)``.
+            asked: contacts to be checked ``(n_pairs,)``.
         """
         whole, config, comm, n = self.whole, self._config, self._config.comm, len(self.pairs)
         asked = asked & self.some & ~np.array([pair.mutual for pair in self.pairs])
@@ -133,11 +133,11 @@ class TargetCorners:
         near, label = self._near(asked)
         pressing = sums_of_rows(whole.label, whole.trial.lam[:, None], n)[:, 0]
         some, force = reduced(comm, np.stack([np.bincount(label, minlength=n), pressing]))
-        # bodies that part press hardly any more
+        # separating bodies have small forces, so that the largest so far counts
         self.largest[asked] = np.maximum(force, self.largest)[asked]
         if not some.any():
             return {}
-        # beside a contactor none is deeper than it is away from there
+        # a corner near a contactor is no deeper than its distance from it
         least = ON_FACET * float(self.smallest[asked].min())
         away = 4.0 * config.size * np.arange(1, n + 1)
         places, points = (np.column_stack([x, away[k]]) for x, k in ((config.x[near], label), (whole.points, whole.label)))
@@ -153,7 +153,7 @@ class TargetCorners:
         p = surface.project_onto(config.x[near], of_contact[label])
         depth, part = -p.gap, -p.gap / p.facet_size
         inside = (part > ON_FACET) & (p.from_end > 0.0) & (p.beyond == 0.0).all(axis=1)
-        # deeper than the cell behind the facet it may as well be behind the body
+        # a corner deeper than the cell behind the facet may have left the body at its back
         inside &= depth < surface.of_facets(p.facet, surface.facets.depth)
         if not reduced(comm, int(inside.sum())):
             return {}
@@ -170,7 +170,7 @@ class TargetCorners:
             which = np.flatnonzero(inside & (label == k))
             found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in which]
             everywhere = sorted((one for there in comm.allgather(found) for one in there), reverse=True)
-            # of equals the one that no rounding and no partition chooses
+            # of equally deep corners, take the first by position, independent of rounding and partition
             deepest = min(place for part, place, _ in everywhere if part >= (1.0 - TIED) * everywhere[0][0])
             size, place, deep = next(one for one in everywhere if one[1] == deepest)
             missing = lacking[k] / self.largest[k] if self.largest[k] > 0.0 else np.inf
@@ -178,13 +178,13 @@ class TargetCorners:
         return told
 
     def _at_own_corners(self, k: int) -> bool:
-        """Whether contactors of a contact at corners or ends of their own surface press (collective)."""
+        """Whether contactors of a contact at corners or ends of their own surface are active (collective)."""
         pair, config = self.pairs[k], self._config
         corners = corner_nodes(config, facets_of(config, self._tags[k], "contactor"))
         return bool(reduced(config.comm, int(np.isin(pair.nodes[pair.trial.active], corners).sum())))
 
     def _near(self, asked: Bools) -> tuple[Indices, Ints]:
-        """Corners in the box of the contactors that are no farther from the target than a facet is large, and contacts (collective)."""
+        """Corners inside the box around contactors within one facet size of the target, and their contacts (collective)."""
         whole, config, g = self.whole, self._config, self._config.gdim
         points, label = whole.points, whole.label
         near = asked[label] & (np.linalg.norm(points - whole.projection.foot, axis=1) <= self.reach[label])
