@@ -1,4 +1,4 @@
-"""Contact: what the user declares about two surfaces, and the pair that it makes of them in a problem."""
+"""Contact: the user's declaration of two surfaces, and the interface made from it in a problem."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Contact(WatchedContact, given.Sealed):
     """
 
     SETTABLE = dict.fromkeys(("friction", "offset"))
-    #: Whether it is one of those that a general contact consists of.
+    #: Whether it is part of a general contact.
     of_all_surfaces = False
 
     def __init__(
@@ -184,7 +184,7 @@ class Contact(WatchedContact, given.Sealed):
         )
 
     def __repr__(self) -> str:
-        """Its name, coupling and sliding, and friction and a tie if there is any."""
+        """Name, coupling and sliding, with friction and tie if present."""
         law, coupling = as_law(self._friction), self.coupling if isinstance(self.coupling, str) else self.coupling.__name__
         friction = "" if law.field == 0.0 else f", friction={type(law).__name__}({', '.join(map(given.shown, parameters(law)))})"
         tied = f", tied={self.tied!r}" if self.tied else ""
@@ -215,16 +215,16 @@ class Contact(WatchedContact, given.Sealed):
         self._friction = value
 
     def _take_friction(self, law: FrictionLaw, mu: Array | None) -> None:
-        """Take a law with these values at the contactors ``(n,)``, None for zeros."""
+        """Set a friction law with these values at the contactors ``(n,)``, None for zeros."""
         if self.pair.frictional:
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
 
     def take_load(self, at: float, known: bool = False) -> None:
-        """Take friction at a load factor or a time, if it follows these (collective).
+        """Update friction to a load factor or a time, if it depends on these (collective).
 
         Args:
             at: load factor, in dynamics the time.
-            known: whether the contact's committed state has been reached with it; else the next step begins with it.
+            known: whether the committed state belongs to it; otherwise it applies from the next step on.
         """
         self._at = at
         law = as_law(self._friction)
@@ -238,11 +238,11 @@ class Contact(WatchedContact, given.Sealed):
             self.pair.set_friction(law, value)
 
     def friction_values(self) -> Array:
-        """Values that friction has at this rank's contactors, now or elsewhere; none without friction."""
+        """Friction parameters at this rank's contactors; empty without friction."""
         return np.zeros(0) if self.pair.friction is None else self.pair.friction.value
 
     def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
-        """Values of a law's parameter at contactors ``(n,)``, where they have been placed; None if there is no friction (collective)."""
+        """Values of a law's parameter at contactors ``(n,)`` after a placement; None without friction (collective)."""
         T = None
         if isinstance(law.field, OfTemperature):
             from uem_dolfinx.contact.thermal.sides import mean_temperatures
@@ -251,7 +251,7 @@ class Contact(WatchedContact, given.Sealed):
         return values_at(law, self.config, nodes, self.name, self.contactor.dim > 0, at, T)
 
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
-        """Values at contactors that have been placed ``(n,)``; None where they do not depend on that (collective)."""
+        """Values at contactors after a placement ``(n,)``; None if they do not depend on it (collective)."""
         law = as_law(self._friction)
         return self._friction_at(law, self.pair.nodes, self._at) if isinstance(law.field, OfTemperature) else None
 
@@ -277,12 +277,12 @@ class Contact(WatchedContact, given.Sealed):
         self.pair.project()
 
     def _set_offset(self) -> None:
-        """Hand the present offset to the pair, if there has been any (collective)."""
+        """Set the present offset in the pair, if an offset is or was in use (collective)."""
         if self._offsets is not None or callable(self._offset) or self._offset != 0.0:
             self._offsets_of_pair().set(self._offset)
 
     def _offsets_of_pair(self) -> Offsets:
-        """What lowers the pair's gaps, made when first asked for."""
+        """Offsets of the pair's gaps, made at the first call."""
         if self._offsets is None:
             from uem_dolfinx.contact.offsets import Offsets
 
@@ -299,7 +299,7 @@ class Contact(WatchedContact, given.Sealed):
         return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
 
     def words(self) -> dict[str, str]:
-        """How it is tied, for checkpoints, which go on with the same alone."""
+        """Settings of the tie, which must be equal when a checkpoint is resumed."""
         return {"tied and adjust": f"{self.tied}, {self.adjust}"} if self.tied or self.adjust else {}
 
     def attach(
@@ -314,15 +314,15 @@ class Contact(WatchedContact, given.Sealed):
             duration: length of the present step, a time; None in statics.
 
         Raises:
-            InputError: if friction depends on the speed of slip, and steps have no length.
+            InputError: if friction depends on the speed of slip, and steps have no duration.
             TagError: if a tag is empty or of the wrong dimension.
             SpaceError: if a tag belongs to another mesh.
             SurfaceError: if contactor and target share nodes, or a rigid target is of another dimension.
-            UserFunctionError: of a rigid target's functions.
+            UserFunctionError: from the functions of a rigid target.
             OrientationError: if a target facet lies inside a body.
         """
         self.config, self._at, facets = config, at, config.tdim - 1
-        # of a problem that could not be made
+        # reset data of a problem that failed during set-up
         self._pair, self._fields, _ = None, {}, self.__dict__.pop("surface", None)
         given.alike(
             config.comm, f"contact '{self.name}'", sliding=self.sliding, normals=self.normals, thickness=self.thickness,
@@ -367,7 +367,7 @@ class Contact(WatchedContact, given.Sealed):
         return self._pair
 
     def _discretised(self, nodes: Indices, target: Target, **how: Any) -> tuple[Discretisation, Mortar | None]:
-        """What unites contactors with the target, and the means that a tie takes, as of ``Tie`` (collective)."""
+        """The discretisation, and the means for a tie, see ``Tie`` (collective)."""
         config = self.config
         # points have no facets to integrate over
         if self.coupling == "mortar" and self.contactor.dim > 0:
@@ -392,7 +392,7 @@ class Contact(WatchedContact, given.Sealed):
     def _sliding_of(
         self, nodes: Indices, discretisation: Discretisation, free: Bools, duration: Callable[[], float] | None
     ) -> Sliding | None:
-        """What friction adds, or None without; slip that wears is followed without friction, too (collective)."""
+        """Friction of the interface, or None; with wear also for frictionless contact, to accumulate slip (collective)."""
         law = as_law(self.friction)
         value = self._friction_at(law, nodes, self._at)
         if value is None and not self._wears:
@@ -412,7 +412,7 @@ class Contact(WatchedContact, given.Sealed):
         )  # fmt: skip
 
     def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Tie:
-        """What ties contactors; ``means`` as of ``Tie``."""
+        """Permanent tie of contactors; ``means`` as in ``Tie``."""
         from uem_dolfinx.contact.ties.tie import Tie
 
         return Tie(
@@ -426,7 +426,7 @@ class Contact(WatchedContact, given.Sealed):
 
         Raises:
             InputError: for any other contact.
-            SurfaceError: if nothing touches.
+            SurfaceError: if no contactor is active.
         """
         if self.tied != "after":
             raise InputError(f"contact '{self.name}': tie() is for contacts that are made with tied='after'")
@@ -434,7 +434,7 @@ class Contact(WatchedContact, given.Sealed):
         self.pair.project()
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
-        """Owned contactor nodes, and what they may touch (collective)."""
+        """Owned contactor nodes and their target (collective)."""
         nodes = surface_nodes(config, self.contactor)
         if hasattr(self.target, "project"):
             return nodes, shared_target(self.target, config.comm, config.gdim)

@@ -1,4 +1,4 @@
-"""What an interface tells of its contactors, those that are tied among them, for results, checks and checkpoints."""
+"""Read access to an interface, including tied contactors, for results, checks and checkpoints."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Told:
-    """What results, checks and checkpoints ask; attributes as those of ``Interface``."""
+    """Read access for results, checks and checkpoints; attributes as in ``Interface``."""
 
     name: str
     config: Configuration
@@ -46,12 +46,12 @@ class Told:
 
     @property
     def members(self) -> Sequence[Any]:
-        """Interfaces of single contacts that it consists of: itself, unless several are treated together."""
+        """Interfaces of the single contacts: itself, unless several are treated together."""
         return [self]
 
     @property
     def whole(self) -> Any:
-        """What it is treated with: itself, unless it is one of several."""
+        """The joint interface that contains it: itself, unless several are treated together."""
         return self
 
     @property
@@ -60,7 +60,7 @@ class Told:
         return np.zeros(len(self.nodes), np.int64)
 
     def turns(self) -> Sequence[Any]:
-        """Rows of contactors that are returned to the target together, each node once, in turn (collective)."""
+        """Groups of contactors that are returned to the target one after the other, each group with distinct nodes (collective)."""
         return [slice(None)]
 
     def name_at(self, i: int) -> str:
@@ -69,12 +69,12 @@ class Told:
 
     @property
     def asked(self) -> bool:
-        """Whether any contactor on any rank is in question, as placed last."""
+        """Whether any contactor on any rank was near the target in the last placement."""
         return self.discretisation.asked
 
     @property
     def far(self) -> bool:
-        """Whether it is not looked at, since the surfaces are far apart."""
+        """Whether it is skipped, since the surfaces are separated."""
         return self.discretisation.far
 
     @far.setter
@@ -83,7 +83,7 @@ class Told:
 
     @property
     def far_of(self) -> Bools:
-        """Which of the ``members`` are not looked at ``(n_members,)``."""
+        """Which of the ``members`` are skipped ``(n_members,)``."""
         return np.array([self.far])
 
     @far_of.setter
@@ -91,17 +91,17 @@ class Told:
         self.far = bool(far[0])
 
     def set_offset(self, offset: Array | None) -> None:
-        """Take other offsets ``(n,)``; contactors are to be placed again (collective)."""
+        """Set offsets ``(n,)``; contactors must be placed again (collective)."""
         self.discretisation.set_offset(offset)
 
     def know_friction(self, law: FrictionLaw, value: Array) -> None:
-        """Take a law of friction, and values of its parameter ``(n,)``, with which the committed state has been reached (collective)."""
+        """Set the friction law and parameter values ``(n,)`` of the committed state (collective)."""
         assert self.friction is not None
         self.friction.set(law, value)
 
     @property
     def target(self) -> Target:
-        """What the contactors may touch."""
+        """Target of the contactors."""
         return self.discretisation.target
 
     @property
@@ -111,17 +111,17 @@ class Told:
 
     @property
     def projection(self) -> Projection:
-        """Of the contactors, as last placed."""
+        """Projection of the contactors in the last placement."""
         return self.kinematics.projection
 
     @property
     def gap(self) -> Array:
-        """Gaps that decide on contact ``(n,)``: nodal gaps, or control gaps on a degree-2 surface."""
+        """Deciding gaps ``(n,)``: nodal gaps, or control gaps on a degree-2 surface."""
         return self.kinematics.gap
 
     @property
     def off(self) -> Bools:
-        """Contactors that have slid past an end of the target, and are not taken back yet, or are tied ``(n,)``."""
+        """Contactors past an end of the target, barred, or tied ``(n,)``."""
         return self._past_end if self.tie is None else self._past_end | self.tie.excluded
 
     @property
@@ -130,17 +130,17 @@ class Told:
 
     @property
     def movable(self) -> Bools:
-        """Contactors whose gap can be closed, for all the Dirichlet conditions ``(n,)``."""
+        """Contactors whose gap can be closed despite the Dirichlet conditions ``(n,)``."""
         return self.kinematics.movable
 
     @property
     def pattern(self) -> Ints:
-        """What tells one state of each contactor from others: whether it is active, in which corner, and where it slips ``(n, k)``."""
+        """Integers that identify the state of each contactor: active, corner, stick and direction of slip ``(n, k)``."""
         told, f = np.column_stack([self.trial.active, self.trial.held]).astype(np.int64), self.trial.friction
         return told if f is None else np.column_stack([told, f.stick, np.rint(f.direction).astype(np.int64)])
 
     def stiffness_across(self, stiffness: Array | None) -> Array:
-        """Stiffness of the contactors along their normals ``(n,)``, from that of the owned nodes ``(n_owned, gdim)``."""
+        """Stiffness of the contactors along their normals ``(n,)``, from the stiffness at owned nodes ``(n_owned, gdim)``."""
         assert stiffness is not None
         return np.asarray(np.einsum("ng,ng->n", self.projection.normal**2, np.abs(stiffness[self.nodes])))
 
@@ -151,7 +151,7 @@ class Told:
         return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau, bond=t.bond)
 
     def largest_gap_here(self) -> float:
-        """Largest gap of an active contactor of this rank, or distance from where it is to stick or tied, a length."""
+        """Largest gap of an active contactor of this rank, or distance from its anchor or tied position, a length."""
         here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
         if self.friction is not None:
             here = max(here, float(self.friction.distances(self.trial, self.redundant).max(initial=0.0)))
@@ -163,7 +163,7 @@ class Told:
 
     @property
     def tied(self) -> Bools:
-        """Contactors that are united with the target in all components for good ``(n,)``."""
+        """Contactors tied permanently to the target in all components ``(n,)``."""
         return np.zeros(len(self.nodes), dtype=bool) if self.tie is None else self.tie.tied
 
     @property
@@ -177,22 +177,22 @@ class Told:
         return int(reduced(self.config.comm, int(self.united.sum())))
 
     def pressing(self) -> tuple[Array, Array]:
-        """Forces across ``(n,)`` and along ``(n, gdim)`` the target that belong to ``areas`` (collective)."""
+        """Normal ``(n,)`` and tangential forces ``(n, gdim)`` that belong to ``areas`` (collective)."""
         t = self.trial
         tau = 0.0 * t.force if t.friction is None else t.friction.tau
         return (t.lam, tau) if self.tie is None else self.tie.pressing(t, self.kinematics.projection.normal, t.lam, tau)
 
     def areas(self, areas: Array, current: bool, reference: Array) -> Array:
-        """As of ``PressureMap``; ``reference (n,)`` are the integrals over the reference surface (collective)."""
+        """See ``PressureMap.areas``; ``reference (n,)`` are the integrals over the reference surface (collective)."""
         found = self.kinematics.pressure_map(current).areas(areas)
         return found if self.tie is None else self.tie.areas(areas, reference, found)
 
     def kept_gaps(self) -> Array:
-        """Heights over the target that tied contactors keep, of this rank ``(k,)``."""
+        """Constant heights of this rank's tied contactors over the target ``(k,)``."""
         return np.zeros(0) if self.tie is None else self.tie.kept_gaps()
 
     def torn(self) -> Array:
-        """How far contactors are from where they are tied if their equations were left out ``(n,)``."""
+        """Violation of tie equations that were dropped as redundant ``(n,)``."""
         return np.zeros(len(self.nodes)) if self.tie is None else self.tie.torn()
 
     @property
@@ -202,20 +202,20 @@ class Told:
 
     @property
     def works(self) -> bool:
-        """Whether its forces do work by themselves, as where a rigid target moves."""
+        """Whether its forces do external work, for example on a moving rigid target."""
         return self.discretisation.target.motion is not None or (self.tie is not None and self.tie.works)
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
-        """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without any (collective)."""
+        """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without loads (collective)."""
         return None if self.tie is None else self.tie.applied_forces()
 
     @property
     def functions(self) -> dict[str, fem.Function]:
-        """Further Functions that a run goes on from, by name; they are read before ``from_checkpoint`` is called."""
+        """Further Functions for checkpoints, by name; they are read before ``from_checkpoint`` is called."""
         return {} if self.tie is None else {"displacement it was tied at": self.tie.at}
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays ``(n, ...)`` that a run goes on from, facets by what tells them in any partition (collective)."""
+        """Arrays ``(n, ...)`` for checkpoints, with facets as keys independent of the partition (collective)."""
         kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant}
         kept |= self.committed.to_checkpoint(self.target.keys_of)
         return kept if self.tie is None else kept | self.tie.to_checkpoint()

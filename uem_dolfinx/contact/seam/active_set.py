@@ -1,9 +1,9 @@
-"""Which contactors are active: which are released, which activated. Pure functions of arrays, without mesh and without communication.
+"""Active set: release and activation of contactors. Pure functions of arrays, without mesh and without communication.
 
-The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. They are settled on the linearised problem, before anything
-moves: its solution predicts gaps and forces, contactors that it shows on the wrong side are exchanged, and it is solved again
-(block pivoting; Judice and Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Violations.count`` and
-``Violations.worst`` over them between ``find_violations`` and ``exchange``.
+The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. They are solved on the linearised problem, before any node
+moves: its solution predicts gaps and forces, violated contactors are exchanged, and it is solved again (block pivoting; Judice and
+Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Violations.count`` and ``Violations.worst``
+over them between ``find_violations`` and ``exchange``.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ PATIENCE = 30
 
 @dataclass(frozen=True)
 class Violations:
-    """Contactors that break the conditions of contact, each ``(n,)``.
+    """Contactors that violate the contact conditions, each ``(n,)``.
 
     Attributes:
-        enter: open ones whose gap is negative.
-        release: closed ones whose force is tension, or that can no longer be held.
-        violation: how far, as a force: the tension, or the overlap times the contactor's stiffness; zero where nothing is wrong.
+        enter: open contactors with negative gap.
+        release: closed contactors in tension, or whose gap can no longer be closed.
+        violation: as a force: the tension, or the penetration times the contactor's stiffness; zero if not violated.
     """
 
     enter: Bools
@@ -57,13 +57,13 @@ class Violations:
 
     @classmethod
     def none(cls, n: int) -> Violations:
-        """Nothing is wrong with n contactors."""
+        """No violation at n contactors."""
         right = np.zeros(n, dtype=bool)
         return cls(right, right, np.zeros(n))
 
     @property
     def count(self) -> int:
-        """Number of wrong contactors."""
+        """Number of violated contactors."""
         return int(self.enter.sum() + self.release.sum())
 
     @property
@@ -73,35 +73,35 @@ class Violations:
 
     @property
     def which(self) -> Bools:
-        """All of them ``(n,)``."""
+        """All violated contactors ``(n,)``."""
         return self.enter | self.release
 
     def among(self, kept: Bools) -> Violations:
-        """Those alone that are ``kept (n,)``."""
+        """The violations of ``kept (n,)`` contactors."""
         return Violations(self.enter & kept, self.release & kept, np.where(kept, self.violation, 0.0))
 
     def among_the_worst(self, worst: float) -> Violations:
-        """Those alone whose violation equals the ``worst`` of all."""
+        """The violations equal to the ``worst`` of all."""
         return self.among(self.violation >= (1.0 - TIED) * worst)
 
     def of_contact(self) -> Violations:
-        """Those alone that break the conditions of contact."""
+        """The violations of the contact conditions."""
         return self
 
     def on_first_touch(self, gap: Array, depth: float) -> Violations:
-        """Those alone that enter by so much at least, a length, and all that are released; ``gap (n,)`` decides on contact."""
+        """Entering contactors of at least this ``depth``, a length, and all released ones; ``gap (n,)`` are deciding gaps."""
         return Violations(self.enter & (gap <= -depth), self.release, self.violation)
 
 
 def deep_enough(span: float, gdim: int) -> float:
-    """Part of the deepest overlap from which contactors touch at first, of those that would overlap if nothing gave way.
+    """Smallest depth, as part of the deepest overlap, of contactors activated at first touch.
 
-    In the plane a cylinder touches within a half width ``a`` where bodies of size L have given way by
-    ``a^2 / (2 R) (log(4 L / a) - 1/2)`` (Johnson, Contact Mechanics, 1985, 5.6): the smaller the contact, the less of the overlap.
-    The overlap is some twice as wide. Taken are ``GIVING_WAY`` for L, which is a body's radius, and ``HALF_WIDTH`` for a.
+    In 2D, a cylinder has the contact half width ``a`` for an approach of ``a^2 / (2 R) (log(4 L / a) - 1/2)``, with bodies of size
+    L (Johnson, Contact Mechanics, 1985, 5.6). The contact is smaller than the overlap of undeformed bodies, about half as wide.
+    ``GIVING_WAY`` is used for L, a body's radius, and ``HALF_WIDTH`` for a.
 
     Args:
-        span: width of the overlap over the model's size; zero where a single contactor overlaps.
+        span: width of the overlap over the model's size; zero for a single contactor.
         gdim: dimension of space.
     """
     if gdim == 3 or span == 0.0:
@@ -120,17 +120,17 @@ def find_violations(
     force_rounding: Array | float,
     gap_rounding: float,
 ) -> Violations:
-    """Find the contactors that break the conditions.
+    """Find the contactors that violate the contact conditions.
 
     Args:
         state: of the contactors.
-        gap: that decides on contact, here or predicted ``(n,)``.
-        lam: contact force along the normal, here or predicted ``(n,)``.
-        off: contactors past the target's end, or that may not enter for another reason ``(n,)``.
+        gap: deciding gaps, current or predicted ``(n,)``.
+        lam: normal contact force, current or predicted ``(n,)``.
+        off: contactors past the target's end, or excluded for another reason ``(n,)``.
         movable: contactors whose gap can be closed ``(n,)``.
         stiffness: of the contactors along the normal, a force per length ``(n,)``.
-        force_rounding: forces below it are zero, of all or of each contactor ``(n,)``.
-        gap_rounding: gaps below it are zero.
+        force_rounding: smaller forces count as zero, for all or for each contactor ``(n,)``.
+        gap_rounding: smaller gaps count as zero.
     """
     release = state.active & ((lam < -force_rounding) | ~movable)
     enter = ~state.active & ~off & movable & (gap < -gap_rounding)
@@ -139,30 +139,30 @@ def find_violations(
 
 
 def exchange(state: PairState, violated: Violations) -> PairState:
-    """The state in which the wrong contactors have changed sides; forces stay until they are read anew."""
+    """The state after exchange of the violated contactors; forces are unchanged until the next solution."""
     active = (state.active | violated.enter) & ~violated.release
     return replace(state, active=active, passed=state.passed & ~active)
 
 
 class Rule:
-    """Which of the wrong contactors are exchanged, from fast to sure."""
+    """Rules for the exchange of violated contactors, from fast to safe."""
 
-    #: All of them: fast, but it may go in circles.
+    #: All of them: fast, but it may cycle.
     ALL = 0
-    #: The worst alone, with those that tie with it: seldom goes in circles.
+    #: Only the worst, with equal ones: rarely cycles.
     WORST = 1
-    #: The first alone in an order that stays: never does where gaps and forces belong together (a P-matrix; Murty, 1974,
+    #: Only the first in a fixed order: never cycles if the matrix between gaps and forces is a P-matrix (Murty, 1974,
     #: doi:10.1007/BF01580244).
     FIRST = 2
-    #: None: even so a state has come again.
+    #: No exchange: even the last rule has cycled.
     NONE = 3
 
 
 class Pivoting:
-    """Which wrong contactors are exchanged, from exchange to exchange of one linearised problem.
+    """Choice of the exchange rule within one linearised problem.
 
-    A rule that leads to a state that it has been in already would lead there for ever: the next one takes over, until fewer are wrong
-    than ever before, which cannot go on without end either.
+    A rule that returns to an earlier state would cycle, so the next rule is used until the number of violations is lower than ever
+    before. This ends, since the number cannot decrease without end.
     """
 
     def __init__(self) -> None:
@@ -170,25 +170,25 @@ class Pivoting:
         self._tries = PATIENCE
         self._rule = Rule.ALL
         self._seen: set[Hashable] = set()
-        #: States in which the worst has been exchanged alone, and whether it has been twice in one.
+        #: States in which only the worst was exchanged, and whether one of them has recurred.
         self._alone: set[Hashable] = set()
         self._again = False
 
     @property
     def ahead(self) -> bool:
-        """Whether others that are not wrong yet may be exchanged with the worst: not in a state that it went alone in before."""
+        """Whether contactors next to the worst may be exchanged in advance; not after a state has recurred."""
         return self._rule == Rule.WORST and not self._again
 
     def start_again(self) -> None:
-        """Exchange all wrong contactors again, after others have been exchanged with them."""
+        """Return to the exchange of all violated contactors, after an exchange in advance."""
         self._fewest = np.inf
 
     def choose(self, count: int, state: Hashable) -> int:
         """The rule for the next exchange.
 
         Args:
-            count: number of wrong contactors.
-            state: what tells this state of all contactors from others.
+            count: number of violated contactors.
+            state: identifies the state of all contactors.
         """
         if count < self._fewest:
             self._fewest, self._tries, self._rule, self._seen = count, PATIENCE, Rule.ALL, set()
@@ -204,12 +204,12 @@ class Pivoting:
 
 
 def touching(state: PairState, gap: Array, size: float, allowed: Bools) -> PairState:
-    """The state in which contactors that touch without force are active as well.
+    """The state in which contactors that touch without force are also active.
 
     Args:
         state: of the contactors.
         gap: that decides on contact ``(n,)``.
-        size: the model's, a length.
+        size: the model's size, a length.
         allowed: contactors that may be active ``(n,)``.
     """
     return replace(state, active=state.active | ((np.abs(gap) <= TOUCHING * size) & allowed))

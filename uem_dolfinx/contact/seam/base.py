@@ -1,4 +1,4 @@
-"""Contactors and the target that they are searched on, whatever their gaps are."""
+"""Common base of discretisations: contactors and their projection onto the target."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ class OnTarget:
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
-        target: what they may touch.
+        target: target of the contactors.
         free: components without Dirichlet condition of all owned nodes ``(n_owned, gdim)``.
         sliding: ``"finite"`` projects at every placement, ``"small"`` once per step, ``"fixed"`` once.
-        thickness: of the target's body, a length: what has passed its end and is deeper than this lies behind it.
+        thickness: of the target's body, a length: contactors past its end and deeper than this lie behind the body.
         contactor: facets of the contactors, for discretisations that integrate over them.
 
     Attributes:
         free: components without Dirichlet condition of the contactors ``(n, gdim)``.
-        free_of_owned: of all owned nodes.
+        free_of_owned: the same of all owned nodes ``(n_owned, gdim)``.
         prescribed: whether any contactor on any rank has a Dirichlet condition.
         frictional: whether there is friction.
-        anchor: projection whose feet a contact with small or fixed sliding keeps.
-        offset: by how much both surfaces together are taken to be thicker at the contactors ``(n,)``; None for nothing.
-        far: whether the surfaces are so far apart that contactors are not looked at, see ``solve.bodies.far_apart``.
-        asked: whether any contactor on any rank is in question, as placed last.
+        anchor: projection whose closest points are kept, with small or fixed sliding.
+        offset: additional thickness of both surfaces together at the contactors ``(n,)``; None without offset.
+        far: whether the surfaces are separated, so that contactors are skipped, see ``solve.bodies.far_apart``.
+        asked: whether any contactor on any rank was near the target in the last placement.
     """
 
     ordered_by = -1
@@ -55,18 +55,18 @@ class OnTarget:
         self.anchor: Projection | None = None
         self.offset: Array | None = None
         self.far, self.asked = False, True
-        #: Whether the next step finds feet of small sliding anew.
+        #: Whether small sliding renews its closest points in the next step.
         self._renewing = False
-        #: Positions of contactors and target when they were last projected, the feet that were kept, and what came of it.
+        #: Last projection: positions of contactors and target, the anchor, and the result.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
 
     def hold(self, free: Bools) -> None:
-        """Take which components of the owned nodes have no Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
+        """Set the components of owned nodes without Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
         self.free, self.free_of_owned = free[self.nodes], free
         self.prescribed = bool(reduced(self.config.comm, int(not self.free.all())))
 
     def with_friction(self, mu: Array) -> None:
-        """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
+        """Prepare for friction; ``mu (n,)`` are the slopes of the contactors' cones."""
         self.frictional = True
 
     @property
@@ -75,7 +75,7 @@ class OnTarget:
         return self.target.dofs.ravel()
 
     def on_target(self, points: Array, anchor: Projection | None = None) -> Projection:
-        """The contactors on the nearest places of the target, or with the feet of ``anchor``; as before if nothing moved (collective)."""
+        """Projection onto the nearest points of the target, or with those of ``anchor``; reused if no node has moved (collective)."""
         if not self.target.n_nodes:
             return self.raised(self.target.project(points) if anchor is None else self.target.follow(points, anchor))
         x, last = self.config.x[self.target.dofs], self._projected
@@ -89,19 +89,19 @@ class OnTarget:
         return last[3]
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
-        """The projection of contactors that stay at a height, with normals along the way from convex edges."""
+        """The projection of contactors with offset, with normals that point away from convex edges."""
         assert self.offset is not None
         return found.across_edges(points, self.offset)
 
     def take_feet(self, points: Array) -> Projection:
-        """The contactors on the nearest places of the target, whose feet are kept from now on (collective)."""
+        """Projection onto the nearest points of the target, which are kept from now on (collective)."""
         self.anchor = found = self.target.project(points)
         raised = self.raised(found)
         self._projected = points, self.config.x[self.target.dofs], found, raised
         return raised
 
     def raised(self, projection: Any, which: Ints | None = None) -> Any:
-        """The projection of all contactors, or of ``which (k,)``, with gaps less their offsets."""
+        """The projection of all contactors, or of ``which (k,)``, with offsets subtracted from the gaps."""
         if self.offset is None:
             return projection
         offset = self.offset if which is None else self.offset[which]
@@ -112,26 +112,26 @@ class OnTarget:
         return values
 
     def set_offset(self, offset: Array | None) -> None:
-        """Take other offsets ``(n,)``; contactors are to be placed again."""
+        """Set offsets ``(n,)``; contactors must be placed again."""
         self.offset, self._projected = offset, None
 
     def begin_step(self) -> None:
-        """Small sliding finds its feet anew in every step that follows one that was kept."""
+        """Begin a step: small sliding renews its closest points after every accepted step."""
         if self._renewing:
             self.let_go()
 
     def look_farther(self) -> bool:
-        """Look at surfaces that are far apart, from the next placement on: whether they were."""
+        """Include separated surfaces from the next placement on; return whether they were separated."""
         was, self.far = self.far, False
         return was
 
     def let_go(self) -> None:
-        """Keep no feet: the next placement finds them."""
+        """Drop the kept closest points; the next placement finds new ones."""
         self.anchor, self._renewing = None, False
 
     def commit(self) -> None:
-        """The next step is to find the feet anew; a rigid target that it moves is asked for them before."""
-        # contactors may be taken to where they were before
+        """Accept a step: small sliding renews its closest points in the next step, on rigid targets at the next placement."""
+        # a later return to an earlier state may bring the surfaces together
         self.far = False
         if self.sliding == "small":
             self._renewing = True
@@ -141,14 +141,14 @@ class OnTarget:
 
 @dataclass(frozen=True)
 class PlacedOnTarget:
-    """Implements ``Kinematics`` as far as ``gap_rows``, ``pressure_map`` and ``ties`` tell, for rows that are the same in every state.
+    """Implements ``Kinematics`` from ``gap_rows``, ``pressure_map`` and ``ties``, for rows that are equal in every state.
 
     Attributes:
-        of: what ties the contactors to their target.
+        of: discretisation.
         points: of the contactors ``(n, gdim)``.
-        projection: of the contactors; where a corner holds some, of the corner.
+        projection: of the contactors; onto the corner for contactors held by one.
         nearest: of the contactors, on their nearest facets.
-        gap: that decides on contact ``(n,)``.
+        gap: deciding gaps ``(n,)``.
     """
 
     of: OnTarget
@@ -163,16 +163,16 @@ class PlacedOnTarget:
         return self.projection.normal
 
     def placed_again(self: Kinematics, state: PairState) -> Kinematics:
-        """No equation depends on the state."""
+        """Unchanged, since no equation depends on the state."""
         return self
 
     def follow(self: Kinematics, state: PairState) -> tuple[Kinematics, PairState, bool]:
-        """There is no bend to follow contactors across."""
+        """Unchanged, since equations do not depend on a single facet."""
         return self, state, False
 
     @cached_property
     def ends(self) -> Ends:
-        """They hold no contactors."""
+        """Open ends, which hold no contactors here."""
         return Ends(self.projection, self.of.thickness)
 
     def forces(self: Kinematics, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
@@ -184,12 +184,12 @@ class PlacedOnTarget:
         return Traction(lam, np.einsum("ng,ng->n", force, self.projection.normal), force)
 
     def nodal_friction(self: Kinematics, tau: Array) -> Array:
-        """Of the weights, on both sides of contactors that follow each other (collective)."""
+        """Friction forces by the weights, including contactors that follow each other (collective)."""
         rows = self.gap_rows
         return np.asarray(rows.config.add_at_owners(*self.ties.handed_on(tau))[rows.equations.node])
 
     def nodal_forces(self: Kinematics, state: PairState) -> tuple[Ints, Array]:
-        """Of the state's multipliers, by the rows, and of friction by the weights."""
+        """Nodal forces of the state's multipliers by the rows, and of friction by the weights."""
         nodes, forces = self.gap_rows.forces(state.lam / self.pressure_map(False).force)
         if state.friction is None:
             return nodes, forces

@@ -1,4 +1,4 @@
-"""Contactors that concave corners of a target hold: facets, normals, and the forces that each facet bears."""
+"""Contactors held in concave corners of a target: facets, normals, and the force on each facet."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ WEDGED = 0.99
 
 @dataclass(frozen=True)
 class Corners:
-    """Where contactors stand relative to the edge or vertex that several facets share.
+    """Position of contactors relative to an edge or vertex shared by several facets.
 
     Attributes:
-        which: their places among the pair's contactors ``(k,)``.
+        which: indices among the pair's contactors ``(k,)``.
         count: number of facets, 2 to gdim ``(k,)``.
-        meets: whether the facets share a place to be held at ``(k,)``.
+        meets: whether the facets share an edge or vertex ``(k,)``.
         rising: slope at which the last facet rises above the planes of the others, positive if concave ``(k,)``.
         normals: outward normals of the facets, zero beyond ``count`` ``(k, gdim, gdim)``.
-        away: unit directions along the facets away from the shared place, zero beyond ``count`` ``(k, gdim, gdim)``.
-        axes: orthonormal; the first ``count`` span the normals, the very first is their mean ``(k, gdim, gdim)``.
+        away: unit directions along the facets away from the shared edge or vertex, zero beyond ``count`` ``(k, gdim, gdim)``.
+        axes: orthonormal axes; the first ``count`` span the normals, the first is their mean direction ``(k, gdim, gdim)``.
         nodes: global nodes of the first facet ``(k, nn)``.
-        weights: shape functions at the closest point of the shared place ``(k, nn)``.
-        foot: that point ``(k, gdim)``; past the target's end, where the edge is continued, as far as the contactor is.
-        beyond: how far that is, and in which direction ``(k, gdim)``.
+        weights: shape functions at the closest point of the shared edge or vertex ``(k, nn)``.
+        foot: this closest point ``(k, gdim)``; past the target's end it lies on the continuation of the edge.
+        beyond: vector of ``foot`` past the end ``(k, gdim)``.
         x: positions of the nodes ``(k, nn, gdim)``.
         dN: derivatives of the weights along the edge, zero at a vertex ``(k, nn, fdim - 1)``.
         ddN: second derivatives ``(k, nn, fdim - 1, fdim - 1)``.
-        offset: how far from each facet contactors are held ``(k,)``; None on the facets.
+        offset: distance from each facet at which contactors are held ``(k,)``; None without offset.
     """
 
     which: Ints
@@ -65,33 +65,33 @@ class Corners:
 
     @property
     def flat(self) -> Bools:
-        """Facets that lie in one plane, between which nothing changes ``(k,)``."""
+        """Corners whose facets lie in one plane ``(k,)``."""
         return np.abs(self.rising) <= ON_PLANE
 
     @property
     def summing(self) -> Array:
-        """Vectors whose products with all normals of a corner are one, so that those with forces add up the facets' ``(k, gdim)``."""
+        """Vectors s with ``s . n = 1`` for all normals of a corner, so that ``s . f`` is the sum of the facets' forces ``(k, gdim)``."""
         return np.linalg.pinv(self.normals).sum(axis=2)
 
     def axes_of(self, n: int) -> Array:
-        """Axes of the space that the normals span, of all ``n`` contactors; the others' are zero ``(n, gdim, gdim)``."""
+        """Axes of the span of the normals for all ``n`` contactors; zero for contactors without corner ``(n, gdim, gdim)``."""
         axes = np.zeros((n, *self.axes.shape[1:]))
         axes[self.which] = np.where((np.arange(axes.shape[1]) < self.count[:, None])[:, :, None], self.axes, 0.0)
         return axes
 
     def gaps(self, points: Array) -> Array:
-        """Distances of ``points (k, gdim)`` from the shared place along the axes ``(k, gdim)``."""
+        """Distances of ``points (k, gdim)`` from the shared edge or vertex along the axes ``(k, gdim)``."""
         place = self.foot if self.offset is None else self.foot + self.offset[:, None] * self.summing
         return np.einsum("krg,kg->kr", self.axes, points - place)
 
     def pulls(self, force: Array, mu: Array | float = 0.0) -> Array:
-        """What each facet contributes to the contact forces, along its own outward normal.
+        """Contribution of each facet to the contact forces, along its own outward normal.
 
-        With friction it is along the force on one that leaves the corner over this facet: rotated against that way.
+        With friction, the direction is rotated against the motion that leaves the corner over this facet.
 
         Args:
             force: on the contactors ``(k, gdim)``.
-            mu: coefficients of friction, of all or of each ``(k,)``.
+            mu: coefficients of friction, for all or for each ``(k,)``.
 
         Returns:
             Coefficients ``(k, gdim)`` with which the facets' unit normals sum up to the force, or, where they span less than the
@@ -100,7 +100,7 @@ class Corners:
         """
         mean = self.axes[:, 0]
         over, out = (np.einsum("kjg,kg->kj", v, mean) for v in (self.normals, self.away))
-        # facets that would hold by themselves whatever is between them still let go of what is pulled out
+        # self-locking facets still release contactors that are pulled out
         least = np.where(out > 0, over / np.where(out > 0, out, 1.0), np.inf).min(axis=1)
         along = self.normals - np.minimum(mu, WEDGED * least)[:, None, None] * self.away
         shares = np.einsum("kgr,kg->kr", np.linalg.pinv(along.transpose(0, 2, 1)).transpose(0, 2, 1), force)
@@ -108,17 +108,17 @@ class Corners:
         return shares
 
     def friction(self, force: Array, mu: Array, first: Ints) -> Array:
-        """Friction's part in the forces on contactors that came over one facet, until the others stopped them.
+        """Friction part of the forces on contactors that slid over one facet into the corner.
 
-        A force is a sum of what the facets push with, each along its normal, and of friction, each in its own cone. Contactors have
-        slid over the ``first`` facet: where its cone holds the force, that facet bears it alone. Else friction there is at its limit and
-        leans as the force does, and the others bear the rest, with friction at its limit against leaving over them. So the others
-        push with no more than they must, and as much of the work over the way into the corner is friction's as the cones allow.
+        A force is the sum of normal forces of the facets and of their friction forces, each within its cone. Contactors slid over
+        the ``first`` facet: if its cone contains the force, this facet carries it alone. Otherwise friction there is at its limit,
+        in the direction of the tangential force. The other facets carry the rest, with friction at its limit against leaving over
+        them. Their normal forces are then minimal, and the frictional part of the work of sliding into the corner is maximal.
 
         Args:
             force: on the contactors ``(k, gdim)``.
             mu: coefficients of friction ``(k,)``.
-            first: which facet each came over ``(k,)``.
+            first: facet over which each contactor came ``(k,)``.
 
         Returns:
             Friction ``(k, gdim)``; along the edge that two facets share all of the force is friction.
@@ -139,19 +139,19 @@ class Corners:
             i = np.flatnonzero(others.any(axis=1))
             bearing = np.where((others | place)[i, :, None], along[i], 0.0)
             shares[i] = np.einsum("kgr,kg->kr", np.linalg.pinv(bearing), across[i])
-            # a facet that would have to pull bears nothing
+            # a facet in tension carries no force
             others &= shares > 0
             alone = i[~others[i].any(axis=1)]
             shares[alone] = np.where(place[alone], push[alone, None], 0.0)
         return np.asarray(force - np.einsum("kr,krg->kg", np.maximum(shares, 0.0), np.where(here[:, :, None], self.normals, 0.0)))
 
     def slid_over(self, before: Ints, facets: Ints, way: Array) -> Ints:
-        """Which facet each contactor came over ``(k,)``: the one it was on, or, from farther away, the one that its way lies along best.
+        """Facet over which each contactor came ``(k,)``: its facet at the start of the step, or the facet best aligned with its motion.
 
         Args:
-            before: facets that the contactors were on at the start of the step ``(k,)``.
+            before: facets of the contactors at the start of the step ``(k,)``.
             facets: of the corners, -1 beyond ``count`` ``(k, gdim)``.
-            way: of the contactors past the target in the step ``(k, gdim)``.
+            way: displacement of the contactors relative to the target in the step ``(k, gdim)``.
         """
         here = np.arange(facets.shape[1])[None, :] < self.count[:, None]
         same = (facets == before[:, None]) & here
@@ -159,17 +159,17 @@ class Corners:
         return np.where(same.any(axis=1), np.argmax(same, axis=1), np.argmin(against, axis=1))
 
     def rubbing(self, force: Array, tau: Array, way: Array, first: Ints) -> Array:
-        """Forces of facets along their normals times the ways along them, summed over the facets of each corner ``(k,)``.
+        """Normal forces of facets times the sliding distance along them, summed over the facets of each corner ``(k,)``.
 
-        A contactor slides into a corner over its first facet, whose force on the way is all that it is pushed with along that facet's
-        normal: a part of what another pushes with that is the cosine c of the angle between both. The rest of it, ``1 - c``, acts on
-        the way along the edge between them alone, and on that way there is no friction across the edge.
+        A contactor slides into a corner over its first facet. The force of this facet is then the whole force along its normal: of
+        the force of another facet it includes the part c, the cosine of the angle between the two. The rest, ``1 - c``, acts only
+        on motion along the edge between both, without friction across the edge.
 
         Args:
             force: on the contactors ``(k, gdim)``.
-            tau: friction's part in it ``(k, gdim)``.
-            way: past the target ``(k, gdim)``.
-            first: which facet each came over ``(k,)``.
+            tau: friction part of this force ``(k, gdim)``.
+            way: displacement relative to the target ``(k, gdim)``.
+            first: facet over which each contactor came ``(k,)``.
         """
         n = self.normals[np.arange(len(first)), first]
         over = np.linalg.norm(way - np.einsum("kg,kg->k", way, n)[:, None] * n, axis=1)
@@ -185,7 +185,7 @@ class Corners:
         return np.asarray(np.maximum(push * (over - longest) + pushed * longest + (rest * along).sum(axis=1), 0.0))
 
     def hessians(self, force: Array) -> Array:
-        """Second derivatives of the gaps times their forces: it is the direction of the force that stays on an edge."""
+        """Second derivatives of the gaps times their forces; on an edge, the direction of the force is constant."""
         size = np.linalg.norm(force, axis=1)
         n = force / np.where(size > 0, size, 1.0)[:, None]
         on_edge = (self.dN != 0).any(axis=(1, 2))
@@ -200,14 +200,14 @@ class Corners:
 
 
 def friction_in(corners: Corners | None, state: PairState, before: Ints, mu: Array, way: Array) -> Array:
-    """Friction's part in the forces on contactors that corners hold ``(n, gdim)``; zero for others.
+    """Friction part of the forces on contactors held in corners ``(n, gdim)``; zero for others.
 
     Args:
         corners: that hold contactors.
         state: of the pair.
-        before: facets that the contactors were on at the start of the step ``(n,)``, which they came over.
+        before: facets of the contactors at the start of the step ``(n,)``.
         mu: coefficients of friction ``(n,)``.
-        way: of the contactors past the target in the step ``(n, gdim)``.
+        way: displacement of the contactors relative to the target in the step ``(n, gdim)``.
     """
     tau = np.zeros(state.force.shape)
     if corners is not None:
@@ -217,6 +217,6 @@ def friction_in(corners: Corners | None, state: PairState, before: Ints, mu: Arr
 
 
 def first_over(corners: Corners, state: PairState, before: Ints, way: Array) -> Ints:
-    """Which facet those that corners hold came over ``(k,)``; arguments as those of ``friction_in``."""
+    """Facet over which contactors held in corners came ``(k,)``; arguments as in ``friction_in``."""
     i = corners.which
     return corners.slid_over(before[i], np.column_stack([state.facet[i], state.held[i]]), way[i])

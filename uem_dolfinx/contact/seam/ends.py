@@ -1,4 +1,4 @@
-"""Open ends of targets: which contactors they hold, which are past them, and when these are taken back."""
+"""Open ends of targets: contactors held by an end, contactors past an end, and their return."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COVERED_AGAIN = 0.5
 
 @dataclass(frozen=True)
 class Ends:
-    """Where contactors stand relative to the open ends of their target, and the one rule of which of them take no part in contact.
+    """Position of contactors relative to open ends of the target, and the rule that excludes contactors from contact.
 
     ========================================  ====================  =========================================================
     a contactor                               is remembered as      and is out
@@ -37,14 +37,14 @@ class Ends:
     is not to meet the target                 (``out``)             unless the target covers it
     ========================================  ====================  =========================================================
 
-    ``passed`` is forgotten by what is active, and by what is in front of the target when a step ends.
+    ``passed`` is reset for active contactors, and for contactors in front of the target at the end of a step.
 
     Attributes:
-        projection: on the nearest facets.
+        projection: onto the nearest facets.
         thickness: of the target's body, a length.
-        holds: which contactors an end can hold, one or each ``(n,)``; what is covered of facets fades away there.
-        share: that the target covers of each contactor's facets ``(n,)``, negative where it does not count; None of nodes.
-        out: contactors that are not to meet the target ``(n,)``; None for none.
+        holds: whether an end can hold contactors, for all or for each ``(n,)``; not with mortar, whose covered areas vanish there.
+        share: covered part of each contactor's facets ``(n,)``, negative if irrelevant; None for nodal equations.
+        out: contactors that must not touch the target ``(n,)``, or None.
     """
 
     projection: Projection
@@ -54,7 +54,7 @@ class Ends:
     out: Bools | None = None
 
     def past(self, state: PairState) -> Bools:
-        """Contactors past an end, or that may not meet the target for another reason, those aside that came back with a blow ``(n,)``."""
+        """Contactors past an end, or excluded for another reason except ``barred`` ``(n,)``."""
         p = self.projection
         limit = np.where(state.at_end & ~state.passed, END_HOLDS, ON_SIDE)
         past = (state.passed & (p.gap < -self.thickness)) | (p.way_beyond > limit * p.facet_size)
@@ -63,20 +63,20 @@ class Ends:
         return past if self.out is None else past | self.out
 
     def held(self, state: PairState) -> Bools:
-        """Contactors that an end holds in the next step ``(n,)``: those that come to the target there, until they slide away from it.
+        """Contactors held by an end in the next step ``(n,)``: they first touch there, and have not slid away from it.
 
-        One that let go of the target as soon as it is the least bit past the end would sink into it, and come back with a blow.
+        If released immediately past the end, a contactor would sink below the target and later re-enter it with an impact.
         """
         near = (self.projection.from_end <= END_HOLDS) & ~self.past(state) & self.holds
         return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
 
     def near(self, state: PairState) -> Bools:
-        """Contactors that are active, or not past an end and nearer to the target than one of its facets is long ``(n,)``."""
+        """Contactors that are active, or not past an end and within one facet size of the target ``(n,)``."""
         return state.active | ((self.projection.gap < self.projection.facet_size) & ~self.past(state))
 
 
 def slide_off(state: PairState, off: Bools) -> PairState:
-    """The state in which active contactors that are ``off (n,)`` the target have been let go."""
+    """The state after release of active contactors that are ``off (n,)`` the target."""
     gone = state.active & off
     active = state.active & ~off
     return replace(state, active=active, at_end=state.at_end | gone, passed=(state.passed | gone) & ~active)

@@ -1,8 +1,8 @@
-"""The seam of contact: a discretisation makes a value ``Kinematics`` of where contactors stand relative to their target.
+"""Interface between discretisations and contact: a discretisation makes an immutable ``Kinematics`` for each placement.
 
-An interface asks it for gaps, for rows of equations with the contactor and the kind of each, for forces from the rows' multipliers and
-for their derivatives. How they come about it does not ask, so that nodes against facets, control gaps of quadratic surfaces, or
-integrals over segments differ in nothing else. A law decides on gaps and forces, without knowing of rows.
+It contains gaps, rows of equations with their contactors and kinds, forces from the rows' multipliers, and their derivatives. Nodes
+against facets, control gaps of quadratic surfaces, and integrals over segments have the same members. A contact law acts on gaps
+and forces only, not on rows.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class Traction(NamedTuple):
     """Contact forces of the contactors of an interface.
 
     Attributes:
-        lam: along the normal, that decides on contact ``(n,)``.
-        nodal: of the node along the normal ``(n,)``.
+        lam: normal force that decides on contact ``(n,)``.
+        nodal: normal force at the node ``(n,)``.
         force: on the contactor ``(n, gdim)``.
         tau: friction that belongs to ``lam`` ``(n, gdim)``; None without friction.
-        bond: multipliers of tied contactors' equations ``(n, gdim)``; None where nothing is ever tied.
-        heat: power that goes from contactors to the target without a jump of temperatures, as of ``PairState``; None where none ever does.
+        bond: multipliers of tied contactors' equations ``(n, gdim)``; None without ties.
+        heat: power from contactors to the target by perfect conductance, see ``PairState``; None without such conductances.
     """
 
     lam: Array
@@ -53,18 +53,18 @@ class Traction(NamedTuple):
 
 @dataclass(frozen=True)
 class Constraints:
-    """Uniting equations of one interface, each with its contactor and kind. Lists that do not differ are the same object.
+    """Constraint equations of one interface, each with its contactor and kind. Equal lists are the same object.
 
     Attributes:
-        trial: rows of P: how contactors move, ``du = P dq + c``.
-        test: rows of Q: how contact forces are handed on, ``Q'r = 0``. Equations of both are in the same order and eliminate the same
+        trial: rows of P for the motion of contactors, ``du = P dq + c``.
+        test: rows of Q for the distribution of contact forces, ``Q'r = 0``. Both lists have the same order and eliminate the same
             nodes.
-        frictionless: test rows as they are without the friction of contactors that slip.
-        resisting: trial rows of all relative motions that the contact resists.
-        stopping: trial rows of the relative motions that the contact does not let go on without end.
-        contactor: place of each equation's contactor among those of the interface ``(m,)``.
+        frictionless: test rows without the friction of slipping contactors.
+        resisting: trial rows of all relative motions that contact and friction resist.
+        stopping: trial rows that restrain rigid-body motions.
+        contactor: index of each equation's contactor in the interface ``(m,)``.
         kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
-        tangent: number of the direction along the target of equations by which friction holds, -1 for all others ``(m,)``.
+        tangent: number of the tangential direction for equations of sticking friction, -1 for all others ``(m,)``.
     """
 
     trial: UnitingEquations
@@ -78,21 +78,21 @@ class Constraints:
 
     @classmethod
     def without_friction(cls, trial: UnitingEquations, test: UnitingEquations, contactor: Ints, kind: Ints) -> Constraints:
-        """Equations across the target alone."""
+        """Equations in the normal direction only."""
         return cls(trial, test, test, trial, trial, contactor, kind, np.full(len(kind), -1))
 
     @property
     def tied(self) -> Bools:
-        """Which of the equations hold for good ``(m,)``."""
+        """Which of the equations are permanent ``(m,)``."""
         return np.zeros(len(self), dtype=bool)
 
     @property
     def contact(self) -> Constraints:
-        """Those of contactors that touch, which come first."""
+        """Equations of contactors in contact, which come first."""
         return self
 
     def across(self) -> Constraints:
-        """The test rows across the target alone, without friction."""
+        """The test rows in the normal direction, without friction."""
         which = self.tangent < 0
         rows = self.frictionless.select(which)
         return Constraints.without_friction(rows, rows, self.contactor[which], self.kind[which])
@@ -103,18 +103,18 @@ class Constraints:
 
 @dataclass(frozen=True)
 class GapRows:
-    """Gaps that decide on contact to first order: ``gap_i + scale_i (direction_i . du_i - sum_j C_ij . du_j)`` for every contactor.
+    """Deciding gaps to first order: ``gap_i + scale_i (direction_i . du_i - sum_j C_ij . du_j)`` for every contactor.
 
     Rows along the contact normals come first, one for each contactor in their order; those of further axes of corners follow.
 
     Attributes:
         config: configuration of the displacement.
-        equations: the uniting equations, ``gap / scale`` among them, with no row active ``(m,)``.
-        scale: of the deciding gaps over those of the equations ``(n,)``.
+        equations: the constraint equations with gaps ``gap / scale``, all inactive ``(m,)``.
+        scale: deciding gaps over the gaps of the equations ``(n,)``.
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
         contactor: of each row ``(m,)``.
         kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
-        moved: rows of P where their weights differ from those of the gaps; None where they are the same.
+        moved: rows of P if their weights differ from the weights of the gaps; None if they are equal.
     """
 
     config: Configuration
@@ -156,7 +156,7 @@ class GapRows:
         return nodes, np.concatenate([along, against])
 
     def select(self, which: Ints, active: Bools) -> Constraints:
-        """Rows of the contactors ``which (k,)``, those of ``active (n,)`` contactors active."""
+        """Rows of the contactors ``which (k,)``; rows of ``active (n,)`` contactors are active."""
         chosen = np.zeros(len(self.scale), dtype=bool)
         chosen[which] = True
         rows = chosen[self.contactor]
@@ -177,73 +177,73 @@ class GapRows:
 
 
 class Kinematics(Protocol):
-    """Where contactors stand relative to their target, in one state and at one displacement: a value."""
+    """Position of contactors relative to their target, in one state and at one displacement; immutable."""
 
     @property
     def points(self) -> Array:
-        """Of the contactors ``(n, gdim)``."""
+        """Current positions of the contactors ``(n, gdim)``."""
 
     @property
     def projection(self) -> Projection:
-        """Of the contactors; those that a corner holds are in the corner."""
+        """Projection of the contactors; onto the corner for contactors held by one."""
 
     @property
     def nearest(self) -> Projection:
-        """Of the contactors, on their nearest facets."""
+        """Projection of the contactors onto their nearest facets."""
 
     @property
     def gap(self) -> Array:
-        """That decides on contact ``(n,)``: of nodes, control gaps on a quadratic surface, or weighted ones."""
+        """Deciding gaps ``(n,)``: nodal gaps, control gaps on a quadratic surface, or weighted gaps."""
 
     @property
     def corners(self) -> Corners | None:
-        """Of the target that hold contactors; None if no rank has any."""
+        """Corners of the target that hold contactors; None if no rank has such a corner."""
 
     @property
     def normal(self) -> Array:
-        """Unit vectors across which friction acts ``(n, gdim)``."""
+        """Unit normals of the planes in which friction acts ``(n, gdim)``."""
 
     @property
     def movable(self) -> Bools:
-        """Contactors whose gap can be closed, for all the Dirichlet conditions on both sides ``(n,)``."""
+        """Contactors whose gap can be closed despite the Dirichlet conditions on both sides ``(n,)``."""
 
     @property
     def ties(self) -> Ties:
-        """By what contactors follow other nodes, and how they move relative to these (first time: collective)."""
+        """Weights by which contactors follow other nodes, and their relative motion (first time: collective)."""
 
     @property
     def force_per_multiplier(self) -> Array:
-        """Friction that belongs to ``lam`` over the multipliers of equations along the target ``(n,)`` (first time: collective)."""
+        """Friction ``tau`` over the multipliers of tangential equations ``(n,)`` (first time: collective)."""
 
     @property
     def cone(self) -> Array:
-        """``lam`` over these times the multiplier of a contactor's equation along the normal ``(n,)`` (first time: collective)."""
+        """``lam`` over ``force_per_multiplier`` times the multiplier of the normal equation ``(n,)`` (first time: collective)."""
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
     def placed_again(self, state: PairState) -> Kinematics:
-        """At the same points in another state (collective)."""
+        """Kinematics at the same points in another state (collective)."""
 
     def follow(self, state: PairState) -> tuple[Kinematics, PairState, bool]:
-        """Follow contactors from facet to facet, into corners and out of them: whether equations change here (collective)."""
+        """Follow contactors from facet to facet, into and out of corners; whether equations change on this rank (collective)."""
 
     # -- what decides ----------------------------------------------------------------------------------------------------
 
     @property
     def ends(self) -> Ends:
-        """Where contactors stand relative to open ends of the target; made once."""
+        """Position of contactors relative to open ends of the target; made once."""
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
     @property
     def gap_rows(self) -> GapRows:
-        """Of all contactors; made once."""
+        """Rows of all contactors; made once."""
 
     def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
-        """Contact forces across the target from the multipliers of equations ``(m,)`` (collective)."""
+        """Normal contact forces from the multipliers of equations ``(m,)`` (collective)."""
 
     def nodal_friction(self, tau: Array) -> Array:
-        """Forces at the contactors of multipliers ``tau (n, gdim)`` of rows along the target ``(n, gdim)`` (collective)."""
+        """Forces at the contactors from multipliers ``tau (n, gdim)`` of tangential rows ``(n, gdim)`` (collective)."""
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
         """The state's contact forces at nodes of both bodies: global nodes, repeated or not ``(k,)``, and forces ``(k, gdim)``."""
@@ -252,38 +252,38 @@ class Kinematics(Protocol):
         """Blocks of ``-sum lambda grad^2 g``: lists of global nodes ``(k, m)`` and values ``(k, m gdim, m gdim)``."""
 
     def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
-        """Derivatives of forces of friction (collective).
+        """Derivatives of friction forces (collective).
 
         Args:
             state: of the interface.
-            which: contactors, ascending; where forces act ``at_feet`` those alone that slip ``(k,)``.
-            tau: their friction, as multipliers of rows along the target ``(k, gdim)``.
-            held: those that stick, whose multipliers are kept rather than their coefficients of friction ``(k,)``; None if none do.
+            which: contactors, ascending; with ``at_feet`` only slipping ones ``(k,)``.
+            tau: their friction, as multipliers of tangential rows ``(k, gdim)``.
+            held: sticking contactors, with constant multipliers instead of a constant coefficient of friction ``(k,)``; None if all slip.
 
         Returns:
-            Lists of global nodes, negative where there is none, and blocks, as of ``curvature``.
+            Lists of global nodes, negative for no node, and blocks, see ``curvature``.
         """
 
     def pressure_map(self, current: bool) -> PressureMap:
         """From multipliers along normals to pressures, in the reference or the ``current`` configuration (collective)."""
 
     def heights(self) -> Array:
-        """Of the contactors over the target ``(n,)``, which have the gaps that decide, but for offsets (collective)."""
+        """Heights of the contactors over the target ``(n,)``: deciding gaps without offsets (collective)."""
 
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
-        """Of a field at the contactors, and of what is opposite: places, global nodes and weights, which add up to one (collective)."""
+        """Means of a field at contactors, and on the opposite side: indices, global nodes and weights of sum 1 (collective)."""
 
 
 class Discretisation(Protocol):
-    """Ties contactors to a target. It keeps the feet or segments of a contact with small sliding, and what holds for one step."""
+    """Relates contactors to a target. It keeps closest points or segments for small sliding, and data of one step."""
 
     @property
     def offset(self) -> Array | None:
-        """What gaps are less than heights ``(n,)``; None for nothing."""
+        """Heights minus gaps ``(n,)``; None without offset."""
 
     @property
     def target(self) -> Target:
-        """What the contactors may touch."""
+        """Target of the contactors."""
 
     @property
     def followed(self) -> Indices:
@@ -295,15 +295,15 @@ class Discretisation(Protocol):
 
     @property
     def pointwise(self) -> bool:
-        """Whether each contactor follows the point of the target below it, rather than in a mean."""
+        """Whether each contactor follows the point of the target below it, not a mean."""
 
     @property
     def at_feet(self) -> bool:
-        """Whether contact forces act at the feet of the projection."""
+        """Whether contact forces act at the closest points of the projection."""
 
     @property
     def ordered_by(self) -> int:
-        """Number of the order in which bodies follow each other, which rows of this and others of that order keep; -1 without one."""
+        """Number of the order of bodies that the rows of this and other contacts respect; -1 without an order."""
 
     @property
     def chained(self) -> bool:
@@ -313,31 +313,31 @@ class Discretisation(Protocol):
     def prescribed(self) -> bool:
         """Whether any contactor on any rank has a Dirichlet condition."""
 
-    #: Whether the surfaces are so far apart that contactors are not looked at.
+    #: Whether the surfaces are separated, so that contactors are skipped.
     far: bool
-    #: Whether any contactor on any rank is in question, as placed last; where none is no other function is called in an iteration.
+    #: Whether any contactor on any rank was near the target in the last placement; otherwise no other function is called.
     asked: bool
 
     def with_friction(self, mu: Array) -> None:
-        """Keep what friction needs; ``mu (n,)`` are the slopes of the contactors' cones."""
+        """Prepare for friction; ``mu (n,)`` are the slopes of the contactors' cones."""
 
     def spread(self, values: Array) -> Array:
-        """Of integrals with the shape functions, those with functions that are nowhere negative ``(n,)`` (collective)."""
+        """Integrals with non-negative functions, from integrals with the shape functions ``(n,)`` (collective)."""
 
     def hold(self, free: Bools) -> None:
-        """Take which components of the owned nodes have no Dirichlet condition ``(n_owned, gdim)``, to be followed by ``place``."""
+        """Set the components of owned nodes without Dirichlet condition ``(n_owned, gdim)``; call ``place`` afterwards."""
 
     def set_offset(self, offset: Array | None) -> None:
-        """Take what gaps are less than heights ``(n,)``; contactors are to be placed again."""
+        """Set heights minus gaps ``(n,)``; contactors must be placed again."""
 
     def begin_step(self) -> None:
-        """A step begins, for the first time or anew; contactors are placed again."""
+        """Begin a step, or repeat it; contactors are placed again."""
 
     def look_farther(self) -> bool:
-        """From the next placement on, find what is farther away, for bodies that fall: whether there may be more to be found."""
+        """Extend the search from the next placement on, for unrestrained bodies: whether this can find more facets."""
 
     def place(self, points: Array, state: PairState) -> Kinematics:
-        """The only search: where contactors at ``points (n, gdim)`` stand (collective)."""
+        """Search the target for contactors at ``points (n, gdim)`` (collective)."""
 
     def commit(self) -> None:
-        """A step has been kept."""
+        """Accept a step."""

@@ -1,4 +1,4 @@
-"""Pressures of contactors from the multipliers of their equations, and back: a value that a discretisation makes of a placement."""
+"""Linear maps between multipliers and pressures of contactors, made by a discretisation for each placement."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from uem_dolfinx.geometry.configuration import Configuration
 
 
 class Sums(NamedTuple):
-    """A sparse matrix S of the contactors of all ranks.
+    """A sparse matrix S over the contactors of all ranks.
 
     Attributes:
         config: configuration of the displacement.
         nodes: owned contactors ``(n,)``.
-        column: place of the contactor of each entry ``(k,)``.
+        column: index of the contactor of each entry ``(k,)``.
         row: local node of each entry ``(k,)``.
-        entry: ``(k,)``.
+        entry: value of each entry ``(k,)``.
     """
 
     config: Configuration
@@ -41,7 +41,7 @@ class Sums(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """Integrals with functions that forces belong to, from those with the shape functions: ``B = W (I + S_1) ... (I + S_m)``.
+    """Integrals with the basis of the forces, from integrals with the shape functions: ``B = W (I + S_1) ... (I + S_m)``.
 
     Attributes:
         scale: the diagonal of W ``(n,)``.
@@ -67,14 +67,14 @@ class Basis(NamedTuple):
 
 @dataclass(frozen=True)
 class Stretch:
-    """Pressures that are as powers of sums of facets' shares at their nodes, over these sums as drawn, all else being the same.
+    """Factor of pressures: a power of nodal sums of facet shares over the same sums in the reference configuration.
 
     Attributes:
         config: configuration of the displacement.
         nodes: owned contactors ``(n,)``.
         dofs: local nodes of the facets ``(m, nn)``.
-        shares: of facets with their nodes at ``(m, nn, gdim)``: ``(m, nn)``, and derivatives by these ``(m, nn, nn, gdim)``.
-        power: ``(n,)``.
+        shares: function of node positions ``(m, nn, gdim)`` that returns shares ``(m, nn)`` and derivatives ``(m, nn, nn, gdim)``.
+        power: exponents ``(n,)``.
     """
 
     config: Configuration
@@ -85,7 +85,7 @@ class Stretch:
 
     @cached_property
     def _parts(self) -> list[tuple[Array, Array]]:
-        """Derivatives of shares, and powers over their sums ``(n,)``: where facets are now, and as drawn (first time: collective)."""
+        """Derivatives of shares, and exponents over their sums ``(n,)``: current and reference (first time: collective)."""
         parts = []
         for x, sign in ((self.config.x, 1.0), (self.config.X, -1.0)):
             shares, slopes = self.shares(x[self.dofs])
@@ -94,7 +94,7 @@ class Stretch:
         return parts
 
     def along(self, now: Array, drawn: Array) -> Array:
-        """Relative changes ``(n,)`` if nodes move where they are and where they were drawn ``(n_local, gdim)`` each (collective)."""
+        """Relative changes ``(n,)`` for changes of current and of reference positions ``(n_local, gdim)`` (collective)."""
         found = np.zeros(len(self.power))
         for (slopes, over), moved in zip(self._parts, (now, drawn)):
             change = np.einsum("mbag,mag->mb", slopes, moved[self.dofs])
@@ -102,7 +102,7 @@ class Stretch:
         return found
 
     def back(self, weights: Array) -> list[Array]:
-        """The transpose of :meth:`along`, for weights ``(n,)``: of the owned nodes ``(n_owned, gdim)`` each (collective)."""
+        """Transpose of :meth:`along` for weights ``(n,)``: two arrays over the owned nodes ``(n_owned, gdim)`` (collective)."""
         config, dofs, found = self.config, self.dofs, []
         for slopes, over in self._parts:
             at = config.from_owners(self.nodes, (over * weights)[:, None], dofs.ravel()).reshape(dofs.shape)
@@ -112,16 +112,16 @@ class Stretch:
 
 
 class PressureMap(NamedTuple):
-    """Pressures ``p = F mu / A``: multipliers mu of equations along normals make forces ``lam = F mu``, which act on areas A.
+    """Pressures ``p = F mu / A``: multipliers mu of normal equations correspond to forces ``lam = F mu`` on areas A.
 
     Areas are ``A = B a`` with integrals a of the shape functions over the contactor, except where they are known.
 
     Attributes:
-        force: the diagonal of F ``(n,)``; of contactors in corners, whose forces are several rows', of no use.
+        force: the diagonal of F ``(n,)``; not valid in corners, where several rows contribute to a force.
         basis: B.
         known: contactors with known areas ``(n,)``.
         area: these areas ``(n,)``.
-        stretch: by which pressures change as well, multipliers and areas being the same; None for nothing.
+        stretch: further dependence of pressures on positions at constant multipliers and areas; None without.
     """
 
     force: Array
@@ -131,17 +131,17 @@ class PressureMap(NamedTuple):
     stretch: Stretch | None = None
 
     def areas(self, integrals: Array) -> Array:
-        """A of ``integrals (n,)`` of the shape functions (collective)."""
+        """Areas A from ``integrals (n,)`` of the shape functions (collective)."""
         return self.basis.of(self.of_means(integrals))
 
     def of_means(self, integrals: Array) -> Array:
-        """Areas that means at the contactors' nodes are means over ``(n,)``: those of A without B."""
+        """Areas of means at the contactors' nodes ``(n,)``: A without B."""
         return np.where(self.known, self.area, integrals)
 
     def along(self, integrals: Array) -> Array:
-        """Changes of A with changes of ``integrals (n,)`` (collective)."""
+        """Changes of A for changes of ``integrals (n,)`` (collective)."""
         return self.basis.of(np.where(self.known, 0.0, integrals))
 
     def back(self, weights: Array) -> Array:
-        """The transpose of :meth:`along`, of ``weights (n,)`` (collective)."""
+        """Transpose of :meth:`along` for ``weights (n,)`` (collective)."""
         return np.where(self.known, 0.0, self.basis.back(weights))

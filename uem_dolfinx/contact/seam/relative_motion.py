@@ -1,4 +1,4 @@
-"""How contactors move relative to what they follow, in components that are free and in those that Dirichlet conditions prescribe."""
+"""Motion of contactors relative to the nodes that they follow, in free and in prescribed components."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ MOST_HELD = 0.5 + 1e-6
 
 @dataclass(frozen=True)
 class Ties:
-    """What contactors follow, and which components of their relative motion can change.
+    """Weights by which contactors follow other nodes, and the free components of their relative motion.
 
     Attributes:
         config: configuration of the displacement.
         nodes: owned contactors ``(n,)``.
-        row: place of the contactor of each term ``(k,)``.
-        followed: global node that the term follows ``(k,)``.
-        weight: by which it does ``(k,)``.
-        moves: components of the relative motion that Dirichlet conditions leave free ``(n, gdim)``.
-        held: weights that tell the other components ``(k, gdim)``; None where they are ``weight``.
+        row: index of the contactor of each term ``(k,)``.
+        followed: global node of each term ``(k,)``.
+        weight: weight of this node ``(k,)``.
+        moves: components of the relative motion not prescribed by Dirichlet conditions ``(n, gdim)``.
+        held: weights for the prescribed components ``(k, gdim)``; None if equal to ``weight``.
     """
 
     config: Configuration
@@ -49,7 +49,7 @@ class Ties:
             nodes: owned contactors ``(n,)``.
             terms: ``row``, ``followed`` and ``weight``.
             free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``; None if all contactors are free.
-            at_feet: whether weights are those of points, rather than means.
+            at_feet: whether weights belong to points, not to means.
         """
         row, followed, weight = terms
         if free is None:
@@ -66,7 +66,7 @@ class Ties:
         return cls(config, nodes, row, followed, weight, moves, (weight[:, None] * (1.0 - theirs)) * ratio[row])
 
     def relative(self, du: Array) -> Array:
-        """How an increment ``(n_owned, gdim)`` moves contactors relative to what they follow ``(n, gdim)`` (collective)."""
+        """Relative motion of contactors in an increment ``(n_owned, gdim)``: ``(n, gdim)`` (collective)."""
         theirs, n = self.config.ask_owners(self.followed, du), len(self.nodes)
         way = du[self.nodes] - sums_of_rows(self.row, self.weight[:, None] * theirs, n)
         if self.held is None:
@@ -74,7 +74,7 @@ class Ties:
         return np.where(self.moves, way, du[self.nodes] - sums_of_rows(self.row, self.held * theirs, n))
 
     def table(self, which: Ints) -> tuple[Ints, Array]:
-        """Of contactors ``which (k,)``: global nodes that move them relative to the target, -1 for none, and by how much ``(k, m)``."""
+        """Nodes in the relative motion of contactors ``which (k,)``, global numbers or -1, and their weights ``(k, m)``."""
         order = np.argsort(self.row, kind="stable")
         row = self.row[order]
         first = np.searchsorted(row, np.arange(len(self.nodes)))
@@ -86,7 +86,7 @@ class Ties:
         return nodes[which], share[which]
 
     def tables(self, way: Ties, which: Ints) -> tuple[Ints, Array, Array]:
-        """``table``, with what moves contactors by other weights beside it: nodes, these weights and the others ``(k, m)``."""
+        """``table`` with the weights ``way`` of another relative motion: nodes, own weights and other weights ``(k, m)``."""
         nodes, share = self.table(which)
         if way is self:
             return nodes, share, share
@@ -98,6 +98,6 @@ class Ties:
         )
 
     def handed_on(self, tau: Array) -> tuple[Ints, Array]:
-        """Global nodes ``(k,)`` and forces ``(k, gdim)`` of multipliers ``tau (n, gdim)`` along the target, on both bodies."""
+        """Global nodes ``(k,)`` and forces ``(k, gdim)`` on both bodies from tangential multipliers ``tau (n, gdim)``."""
         nodes = np.concatenate([self.config.to_global(self.nodes), self.followed])
         return nodes, np.concatenate([tau, -self.weight[:, None] * tau[self.row]])

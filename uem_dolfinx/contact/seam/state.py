@@ -1,4 +1,4 @@
-"""What a contact pair remembers of its contactors from iteration to iteration and from step to step."""
+"""State variables of a contact pair, per contactor."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 
 Renumber = Callable[[Ints], Ints]
 
-#: Attributes that number facets.
+#: Attributes that contain facet numbers.
 FACETS = ("facet", "held", "friction_facet")
-#: Before the names of what friction remembers, in checkpoints.
+#: Prefix of the names of friction variables in checkpoints.
 OF_FRICTION = "friction_"
 
 
 @dataclass(frozen=True)
 class FrictionState:
-    """What friction remembers of ``n`` contactors; those that are active and do not stick slip.
+    """Friction variables of ``n`` contactors; active contactors that do not stick are slipping.
 
-    The anchor is the point of the target that a contactor sticks to. For a contactor that is open or slips it is its position at the end of
-    the last step, and stays where it is as long as the contactor sticks.
+    The anchor is the point of the target to which a contactor sticks. For an open or slipping contactor it is the position at the
+    end of the last step; it is constant while the contactor sticks.
 
     Attributes:
-        stick: held at the anchor ``(n,)``.
-        direction: in which a contactor slips over the target, of length one; zero for all others ``(n, gdim)``.
-        tau: force of friction that belongs to ``lam`` ``(n, gdim)``.
-        facet: facet that the anchor is on ``(n,)``; -1 on a rigid target.
-        xi: the anchor's reference coordinates on it ``(n, gdim - 1)``.
-        anchor: what is to be added to that place; on a rigid target the anchor at the target's reference position ``(n, gdim)``.
-        slipped: relative motion along the target while slipping, summed over all steps ``(n, gdim)``.
-        work: that friction has taken from the bodies ``(n,)``.
-        worn: depth that slip has worn off ``(n,)``.
+        stick: whether it sticks to the anchor ``(n,)``.
+        direction: unit vector of the slip direction; zero for other contactors ``(n, gdim)``.
+        tau: friction force that belongs to ``lam`` ``(n, gdim)``.
+        facet: facet of the anchor ``(n,)``; -1 on a rigid target.
+        xi: reference coordinates of the anchor on the facet ``(n, gdim - 1)``.
+        anchor: vector added to this point; on a rigid target the anchor at the target's reference position ``(n, gdim)``.
+        slipped: accumulated slip over all steps ``(n, gdim)``.
+        work: frictional dissipation ``(n,)``.
+        worn: wear depth ``(n,)``.
     """
 
     stick: Bools
@@ -66,26 +66,26 @@ class FrictionState:
 
 @dataclass(frozen=True)
 class PairState:
-    """What is known of ``n`` contactors; frozen so that trial and committed never share an array by accident.
+    """State of ``n`` contactors; immutable, so that trial and committed states may share arrays.
 
     Attributes:
-        active: united to the target ``(n,)``.
-        lam: contact force along the normal, positive in compression ``(n,)``; on a degree-2 surface the control force.
-        nodal: contact force of the node along the normal ``(n,)``; the same as ``lam`` on a degree-1 surface.
+        active: whether the contact equation is active ``(n,)``.
+        lam: normal contact force, positive in compression ``(n,)``; on a degree-2 surface the control force.
+        nodal: normal contact force at the node ``(n,)``; equal to ``lam`` on a degree-1 surface.
         force: contact force on the contactor ``(n, gdim)``.
-        facet: facet that the contactor is on ``(n,)``, -1 before the first projection.
-        held: further facets of a contactor that rests in a concave corner of the target, or -1 ``(n, gdim - 1)``.
-        changes: how often in this step it has changed facets across a bend ``(n,)``.
-        passed: has been past the target's end since it was last in front of it ``(n,)``.
-        at_end: came to the target, or was drawn, at its end, which has held it since, or has slid off it in this step: released there
-            and pushed back it would go to and fro for ever ``(n,)``.
-        barred: came back into the target from past its end with a blow, and has not been in front of it since ``(n,)``.
-        cover: which of its facets a rigid target covers, or where a mesh leaves it a dual function, one bit each in an order that no
-            partition changes ``(n,)``; mortar alone.
-        friction: what friction remembers; None without friction.
-        bond: multipliers of the equations of tied contactors ``(n, gdim)``; None where nothing is ever tied.
-        heat: power that goes from contactors to the target without a jump of temperatures, a column for every field that is united
-            ``(n, n_perfect)``; None where none ever does.
+        facet: target facet of the contactor ``(n,)``, -1 before the first projection.
+        held: further facets of a contactor held in a concave corner of the target, or -1 ``(n, gdim - 1)``.
+        changes: number of changes of facet across an edge in this step ``(n,)``.
+        passed: whether it has been past the target's end since it was last in front of it ``(n,)``.
+        at_end: whether an end has held it since first touch, or it slid off the end in this step; such contactors do not alternate
+            between release and activation ``(n,)``.
+        barred: whether it re-entered the target from past its end while penetrating; ignored until it is in front again ``(n,)``.
+        cover: for mortar only: bits of its facets that a rigid target covers, or on which a mesh leaves it a dual function, in an
+            order independent of the partition ``(n,)``.
+        friction: friction variables; None without friction.
+        bond: multipliers of the equations of tied contactors ``(n, gdim)``; None without ties.
+        heat: power from contactors to the target by perfect conductance, one column per field ``(n, n_perfect)``; None without such
+            conductances.
     """
 
     active: Bools
@@ -105,7 +105,7 @@ class PairState:
 
     @property
     def in_corner(self) -> Bools:
-        """Contactors that a corner holds ``(n,)``."""
+        """Contactors held in a corner ``(n,)``."""
         return np.asarray((self.held >= 0).any(axis=1))
 
     @classmethod
@@ -129,7 +129,7 @@ class PairState:
         """The attributes by name (collective).
 
         Args:
-            keys_of: what tells facets in any partition, from their present numbers ``(k,)``.
+            keys_of: function from facet numbers to keys independent of the partition ``(k,)``.
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
         for name in ("bond", "heat"):
@@ -143,11 +143,11 @@ class PairState:
 
     @classmethod
     def from_checkpoint(cls, kept: Mapping[str, npt.NDArray[Any]], facets_of: Renumber) -> PairState:
-        """The state of which ``to_checkpoint`` returned these arrays (collective).
+        """The state from the arrays of ``to_checkpoint`` (collective).
 
         Args:
-            kept: by name.
-            facets_of: present numbers of facets, from what tells them in any partition ``(k,)``.
+            kept: arrays by name.
+            facets_of: function from these keys to present facet numbers ``(k,)``.
         """
         arrays = {name: _renumbered(name, np.array(array), facets_of) for name, array in kept.items()}
         of_friction = {name: array for name, array in arrays.items() if name.startswith(OF_FRICTION)}

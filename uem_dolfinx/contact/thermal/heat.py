@@ -1,12 +1,12 @@
-"""Heat through the contact of one interface: what leaves contactors enters the target by the same weights, and heat that friction makes.
+"""Heat conduction through one interface, conservative by the weights of the contact, and frictional heat.
 
-The temperature is a field beside the displacement. At every contactor i the power ``q_i A_i`` with ``q_i = h (T_i - sum_a N_a T_a)`` stands
-in the field's equations, at the contactor and with the opposite sign at what it faces. With rows ``v_i`` that make jumps of the
-unknowns these are ``sum_i v_i q_i A_i``, and their derivative is ``sum_i A_i h v_i v_i'``, symmetric. A conductance h(p, g) adds
-``sum_i A_i (T_i - sum_a N_a T_a) v_i (dh/dp p_i' + dh/dg g_i')``, with differences for dh/dp and dh/dg, gaps that change by
-``n (du_i - sum_a N_a du_a)``, and pressures by the rows of K at the contactors, over their areas. Pressures in h, and the heat of friction,
-are those that the last linearised problem has predicted. Perfect conductance unites temperatures, ``v_i' T = 0``, as gaps are
-closed: one unknown of each contactor that touches is eliminated, and the heat is the equation's multiplier.
+The temperature is a further field of the mixed space. The power ``q_i A_i`` with ``q_i = h (T_i - sum_a N_a T_a)`` enters the
+field's equations at contactor i, and with opposite sign at the opposite nodes. With rows ``v_i`` for the jumps of the unknowns,
+these terms are ``sum_i v_i q_i A_i`` with the symmetric derivative ``sum_i A_i h v_i v_i'``. A conductance h(p, g) adds ``sum_i A_i
+(T_i - sum_a N_a T_a) v_i (dh/dp p_i' + dh/dg g_i')``. Here dh/dp and dh/dg are finite differences, gaps change by ``n (du_i - sum_a
+N_a du_a)``, and pressures by the rows of K at the contactors over their areas. Pressures in h, and frictional heat, are the
+prediction of the last linearised problem. Perfect conductance is the constraint ``v_i' T = 0``: one unknown of each touching
+contactor is eliminated, and the heat flow is the multiplier.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ OF_CONDUCTANCE = np.finfo(float).eps ** 0.5
 
 
 class Pair(Protocol):
-    """What heat asks of an interface; attributes as those of ``Interface``."""
+    """Members of an interface that heat needs; attributes as in ``Interface``."""
 
     name: str
     config: Configuration
@@ -57,15 +57,15 @@ class Pair(Protocol):
 
     @property
     def asked(self) -> bool:
-        """Whether any contactor on any rank is in question, as placed last."""
+        """Whether any contactor on any rank was near the target in the last placement."""
 
     @property
     def target(self) -> Target:
-        """What the contactors may touch."""
+        """Target of the contactors."""
 
     @property
     def projection(self) -> Projection:
-        """Of the contactors, as last placed."""
+        """Projection of the contactors in the last placement."""
 
     @property
     def united(self) -> Bools:
@@ -77,31 +77,31 @@ class Pair(Protocol):
 
 
 class Declared(Protocol):
-    """What heat asks of the contact; as those of ``ContactResults``."""
+    """Members of a contact that heat needs; as in ``ContactResults``."""
 
     measure: str
 
     def areas_facing(self, nodes: Indices, normal: Array | None, current: bool) -> Array:
-        """Areas of contactors towards the target ``(n,)`` (collective)."""
+        """Areas of contactors that face the target ``(n,)`` (collective)."""
 
     def measured_areas(self) -> Array:
-        """Areas that pressures are forces over ``(n,)``, zero where there is none (collective)."""
+        """Areas for pressures ``(n,)``, zero where there is no area (collective)."""
 
     def pressing(self) -> tuple[Array, Array]:
-        """Forces across ``(n,)`` and along ``(n, gdim)`` the target (collective)."""
+        """Normal ``(n,)`` and tangential forces ``(n, gdim)`` (collective)."""
 
     def leads(self) -> Bools:
-        """Contactors through which heat passes ``(n,)`` (collective)."""
+        """Contactors that conduct heat ``(n,)`` (collective)."""
 
 
 @dataclass(frozen=True)
 class Passage(Sides):
-    """What is opposite to contactors at one placement.
+    """Heat flow of one placement: the nodes opposite to contactors, and areas.
 
     Attributes:
-        areas: that heat passes through ``(n,)``.
-        force: contact forces over multipliers, as of ``PressureMap`` ``(n,)``.
-        leads: contactors that it passes where they touch ``(n,)``.
+        areas: areas for heat flow ``(n,)``.
+        force: contact forces over multipliers, see ``PressureMap`` ``(n,)``.
+        leads: contactors that conduct heat when they touch ``(n,)``.
     """
 
     areas: Array
@@ -110,17 +110,17 @@ class Passage(Sides):
 
     @property
     def jump(self) -> Array:
-        """By what the contactor's mean exceeds the target's ``(k,)``."""
+        """Weights of the contactor's mean minus the target's mean ``(k,)``."""
         return self.own - self.theirs
 
 
 class HeatEquations(NamedTuple):
-    """Uniting equations of temperatures.
+    """Constraint equations of temperatures.
 
     Attributes:
         rows: the equations ``(m,)``.
-        which: places of their contactors ``(m,)``.
-        own: by what they were divided, the part of the contactor's own unknown in its mean ``(m,)``.
+        which: indices of their contactors ``(m,)``.
+        own: divisor of each equation, the weight of the contactor's own unknown in its mean ``(m,)``.
     """
 
     rows: UnitingEquations
@@ -133,12 +133,12 @@ class Heat:
 
     Args:
         pair: the interface.
-        law: what conducts.
-        contact: which tells areas and pressures.
-        column: of ``PairState.heat``, of a perfect conductance.
+        law: conductance.
+        contact: source of areas and pressures.
+        column: column of ``PairState.heat``, for a perfect conductance.
 
     Raises:
-        InputError, SpaceError: if there is no such field, or if the target's temperature is not known, or given twice.
+        InputError, SpaceError: if the field does not exist, or if the target's temperature is missing or given twice.
     """
 
     def __init__(self, pair: Pair, law: Conductance, contact: Declared, column: int = 0):
@@ -161,19 +161,19 @@ class Heat:
             raise SpaceError(
                 f"{words}: h = inf unites temperatures at the displacement's nodes: give the field the displacement's degree"
             )
-        #: Contactors whose temperatures could not be united, since conditions prescribe all of them ``(n,)``.
+        #: Contactors without a temperature constraint, since conditions prescribe all of its unknowns ``(n,)``.
         self._held: Bools = np.zeros(len(pair.nodes), dtype=bool)
         self._passage: Passage | None = None
 
     @property
     def lags(self) -> bool:
-        """Whether heat depends on contact forces, which an iteration takes from the one before."""
+        """Whether heat depends on contact forces, which are taken from the previous iteration."""
         return callable(self.law.h) or self.law.friction_share is not None
 
     # -- perfect conductance ---------------------------------------------------------------------------------------------
 
     def equations(self) -> HeatEquations:
-        """Of the temperatures of contactors that touch, and of those that may, which only keep their place (collective)."""
+        """Equations for temperatures of touching contactors; contactors that may touch have inactive equations (collective)."""
         pair, at, g = self._pair, self.passage, self._pair.config.gdim
         which = np.flatnonzero((pair.united | pair.reserved) & at.leads)
         place = np.full(len(pair.nodes), -1, dtype=np.int64)
@@ -197,7 +197,7 @@ class Heat:
         return HeatEquations(rows, which, own)
 
     def read(self, equations: HeatEquations, multipliers: Array, redundant: Bools) -> Array:
-        """Power that goes from the contactors to the target ``(n,)``, from the multipliers of equations, some left out, ``(m,)``."""
+        """Power from the contactors to the target ``(n,)``, from the multipliers of equations ``(m,)``, of which some are ``redundant``."""
         power = np.zeros(len(self._pair.nodes))
         power[equations.which] = -multipliers / equations.own
         self._held = np.zeros(len(power), dtype=bool)
@@ -205,7 +205,7 @@ class Heat:
         return power
 
     def torn(self) -> float:
-        """Largest jump of temperatures that are united, over the largest temperature there (collective)."""
+        """Largest violation of the temperature constraints, over the largest temperature there (collective)."""
         if not self.law.perfect:
             return 0.0
         at = self.passage
@@ -219,8 +219,8 @@ class Heat:
 
     @property
     def passage(self) -> Passage:
-        """Of the last placement (collective)."""
-        # a projection that is the same on one rank is so on all
+        """Heat flow of the last placement (collective)."""
+        # projections are identical on all ranks or on none
         if self._passage is None or self._passage.projection is not self._pair.projection:
             pair, current = self._pair, self._contact.measure == "current"
             areas = self._contact.areas_facing(pair.nodes, pair.projection.normal, current)
@@ -229,15 +229,15 @@ class Heat:
         return self._passage
 
     def conductances(self) -> Array:
-        """At the contactors ``(n,)``, none past an end of the target (collective)."""
+        """Conductances at the contactors ``(n,)``, zero past an end of the target (collective)."""
         return self._conductances(*self._pressures_and_gaps())
 
     def _pressures_and_gaps(self) -> tuple[Array, Array]:
-        """At the contactors ``(n,)`` each, of which one is zero (collective)."""
+        """Pressures and gaps at the contactors ``(n,)``; one of the two is zero (collective)."""
         closed = self._pair.united
         p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self._pair.projection.gap, 0.0))
         if callable(self.law.h):
-            # while contact is not settled, and where ties pull, forces may be negative
+            # forces may be negative before the active set has converged, and at ties
             p = np.where(closed, np.maximum(self._contact.pressing()[0], 0.0) * self._per_area(), 0.0)
         return p, g
 
@@ -252,7 +252,7 @@ class Heat:
         return np.where((closed | ~pair.off) & self.passage.leads, h, 0.0)
 
     def _slopes(self) -> Array:
-        """Derivatives of the power with the pressures of closed contactors, and with the gaps of open ones ``(n,)`` (collective)."""
+        """Derivatives of the power by the pressures of closed contactors, and by the gaps of open ones ``(n,)`` (collective)."""
         p, g = self._pressures_and_gaps()
         largest = reduced(self._pair.config.comm, np.array([np.abs(p).max(initial=0.0), g.max(initial=0.0)]), op=MPI.MAX)
         at_p, at_g = OF_CONDUCTANCE * largest
@@ -262,38 +262,38 @@ class Heat:
         return np.asarray(slopes * self.jump() * self.passage.areas)
 
     def jump(self) -> Array:
-        """By what contactors are hotter than the target ``(n,)`` (collective)."""
+        """Temperature of contactors minus temperature of the target ``(n,)`` (collective)."""
         at = self.passage
         rigid = 0.0 if self.law.temperature is None else value(self.law.temperature)
         return at.means(at.jump, self.field.values) - rigid
 
     def power(self) -> Array:
-        """That goes from the contactors to the target ``(n,)`` (collective)."""
+        """Power from the contactors to the target ``(n,)`` (collective)."""
         if self.law.perfect:
             assert self._pair.trial.heat is not None
             return self._pair.trial.heat[:, self._column]
         return np.asarray(self.conductances() * self.jump() * self.passage.areas)
 
     def flux(self) -> Array:
-        """The same per area ``(n,)`` (collective)."""
+        """Power per area from the contactors to the target ``(n,)`` (collective)."""
         if not self.law.perfect:
             return np.asarray(self.conductances() * self.jump())
-        # shape functions of degree 2 have no integral at some nodes
+        # integrals of shape functions of degree 2 vanish at some nodes
         through = np.where(self._pair.united & self.passage.leads, self.passage.areas, 0.0)
         power, areas = (self._pair.discretisation.spread(part) for part in (self.power(), through))
         return np.where(areas > 0, power / np.where(areas > 0, areas, 1.0), 0.0)
 
     def friction(self) -> Array:
-        """Power that the work of friction in the present step is ``(n,)`` (collective)."""
+        """Frictional power in the present step ``(n,)`` (collective)."""
         pair, state = self._pair, self._pair.trial.friction
         assert pair.friction is not None and state is not None
         work = pair.friction.step(pair.trial, pair.committed, pair.kinematics)[-1]
-        # means that stick slip by rounding of places
+        # contactors that stick in a mean slip by the rounding of positions
         slips = np.abs(work) > GAP_ROUNDING * pair.config.size * np.linalg.norm(state.tau, axis=1)
         return np.where(slips, work, 0.0) / value(self.law.dt)
 
     def nodal(self) -> tuple[Array, Array]:
-        """Power that passes from the contactors to the target, as what owned nodes lose, and what friction heats them by ``(n_owned,)``.
+        """Power that owned nodes lose by conduction, and power that they gain by friction, ``(n_owned,)`` each.
 
         Collective.
         """
@@ -308,27 +308,27 @@ class Heat:
         return passing, at.hand_on(share * at.own + (1.0 - share) * at.theirs, self.friction())
 
     def sizes(self) -> Array:
-        """Sizes of what the heat's terms are differences of, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        """Magnitudes of the operands in differences of heat terms, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
         at, pair, hot = self.passage, self._pair, np.abs(self.field.values)
         size = np.zeros(len(at.areas))
         if not self.law.perfect:
             size = self.conductances() * at.areas * (at.means(at.own, hot) + at.means(at.theirs, hot))
         if self.law.friction_share is not None and pair.trial.friction is not None:
-            # slips are differences of places
+            # slips are differences of positions
             size = size + pair.config.size * np.linalg.norm(pair.trial.friction.tau, axis=1) / value(self.law.dt)
         return self.field.rows(at.hand_on(at.own + at.theirs, size))
 
     def residual(self) -> Array:
-        """What heat adds to the residual, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        """Contribution of heat to the residual, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
         passing, made = self.nodal()
-        # what equations hand on stands in no residual
+        # heat flow by constraint equations is not part of the residual
         return self.field.rows(-made if self.law.perfect else passing - made)
 
     def tangent(self) -> list[tuple[Ints, Array]]:
-        """Derivatives of that with temperatures and gaps (collective).
+        """Derivatives of the residual by temperatures and gaps (collective).
 
         Returns:
-            Pairs of global rows ``(k, m)``, -1 for none, and blocks ``(k, m gdim, m gdim)``.
+            Pairs of global rows ``(k, m)``, -1 for no row, and blocks ``(k, m gdim, m gdim)``.
         """
         at, jumps = self.passage, self._jumps()
         kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
@@ -340,9 +340,9 @@ class Heat:
         return found
 
     def by_forces(self, equations: Constraints, lift: Array) -> tuple[Ints, Array]:
-        """Derivatives of that with forces F at the contactors, of which multipliers are ``lift F``, as of ``tangent`` (collective).
+        """Derivatives of the residual by forces F at the contactors, with multipliers ``lift F``; see ``tangent`` (collective).
 
-        None of degree 2, where pressures are those of several contactors' forces.
+        They are neglected at degree 2, where each pressure depends on the forces of several contactors.
 
         Args:
             equations: of the interface, in the present state.
@@ -355,7 +355,7 @@ class Heat:
         return _dyads(weights, self._jumps(), Terms(which, config.to_global(pair.nodes[which]), lift[own]))
 
     def _jumps(self) -> Terms:
-        """By which unknowns contactors are hotter than the target (collective)."""
+        """Temperature jumps of contactors as linear functions of the unknowns (collective)."""
         at, g = self.passage, self._pair.config.gdim
         known: Any = at.halo.take(self.field.terms)
         number, weight = np.hsplit(known, 2)
@@ -368,7 +368,7 @@ class Heat:
 
 
 def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared) -> list[Heat]:
-    """What conductances let through an interface, which is given room for the powers of those that are perfect (collective).
+    """Heat flows of an interface by several conductances; adds columns for perfect ones to its state (collective).
 
     Raises:
         InputError, SpaceError: as ``Heat``.
@@ -380,12 +380,12 @@ def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared) -> list
 
 
 class Terms(NamedTuple):
-    """Linear functions of the unknowns, one for each contactor, by their terms.
+    """Terms of linear functions of the unknowns, one function per contactor.
 
     Attributes:
-        row: place of the contactor ``(k,)``.
+        row: index of the contactor ``(k,)``.
         node: global row of vectors ``(k,)``.
-        vector: of the components there ``(k, gdim)``.
+        vector: coefficients of the components there ``(k, gdim)``.
     """
 
     row: Ints
@@ -394,10 +394,10 @@ class Terms(NamedTuple):
 
 
 def _dyads(scale: Array, left: Terms, right: Terms) -> tuple[Ints, Array]:
-    """``sum_i scale_i v_i w_i'`` of linear functions v and w of contactors, by blocks as those of ``Heat.tangent``."""
+    """``sum_i scale_i v_i w_i'`` of linear functions v and w of contactors, in blocks as in ``Heat.tangent``."""
     row, node = (np.concatenate(both) for both in zip(left[:2], right[:2]))
     some = np.flatnonzero(scale[row] != 0.0)
-    # terms of each contactor side by side
+    # group the terms of each contactor
     order = some[np.argsort(row[some], kind="stable")]
     which, first, i = np.unique(row[order], return_index=True, return_inverse=True)
     place = np.arange(len(order)) - first[i]
