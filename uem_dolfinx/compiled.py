@@ -1,6 +1,6 @@
-"""Code that FFCx has made in this process is found by its signature: DOLFINx lists the whole folder of its cache for each form.
+"""Cache of compiled forms in memory, by signature: DOLFINx lists the whole folder of its disk cache for each form.
 
-That takes as long as many forms were ever compiled: with the ten thousand files of a long development some 10 ms for each form.
+The time for this grows with the number of files: about 10 ms for each form with ten thousand files after long development.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from mpi4py import MPI
 import ufl
 from dolfinx import jit
 
-#: What was compiled, by signature and options; no more than are unlike each other.
+#: Compiled forms by signature and options, each once.
 _known: dict[tuple[str, str], Any] = {}
 
 
 @contextmanager
 def _meshes_kept(what: Any) -> Iterator[None]:
-    """Leave the meshes of a form as they are.
+    """Restore the coordinate elements of a form's meshes.
 
-    FFCx 0.5 gives them another coordinate element where it compiles anew, which changes the hash of all that is made of them later.
+    FFCx 0.5 replaces them when it compiles a form, which would change the hash of all later forms on these meshes.
     """
     domains = [(domain, domain.ufl_coordinate_element()) for domain in (what.ufl_domains() if isinstance(what, ufl.Form) else ())]
     try:
@@ -35,9 +35,9 @@ def _meshes_kept(what: Any) -> Iterator[None]:
 
 @contextmanager
 def kept() -> Iterator[None]:
-    """Within this block DOLFINx compiles, or looks up in its cache, only what this process has not compiled before.
+    """Within this block DOLFINx compiles, or searches its disk cache for, only forms that are new in this process.
 
-    Whether it has is agreed on by all ranks, which compile together.
+    A form is new for all ranks, which compile together, if it is new for any rank.
     """
     compile_anew = jit.ffcx_jit
 
@@ -50,7 +50,7 @@ def kept() -> Iterator[None]:
         if not comm.allreduce(key in _known, op=MPI.LAND):
             with _meshes_kept(what):
                 compiled, module, _ = compile_anew(comm, what, *args, **options)
-            # as DOLFINx finds it in its cache, without the source
+            # the format of DOLFINx for forms from its cache, without the source
             _known[key] = compiled, module, (None, None)
         return _known[key]
 

@@ -29,7 +29,7 @@ def _is_rank_zero(record: logging.LogRecord) -> bool:
 
 
 logger = logging.getLogger("uem_dolfinx")
-"""Rank 0's logger; the application sets handlers and levels."""
+"""Rank 0's logger; handlers and levels are the application's business."""
 logger.addFilter(_is_rank_zero)
 
 

@@ -1,10 +1,10 @@
-"""What is asked of MUMPS beside solving: whether it needs more workspace, the sign of the determinant, and what a factorisation takes.
+"""Functions of MUMPS in addition to solving: workspace, sign of the determinant, estimated cost, and Schur complements.
 
-Figures are those of its users' guide: INFOG(1) is how a factorisation ended, ICNTL(14) the workspace beyond what the analysis estimates,
-INFOG(12) the number of negative pivots of a symmetric one, ICNTL(7) and INFOG(7) how unknowns are and were ordered, ICNTL(33) whether the
-determinant is told, RINFOG(12) its mantissa; RINFOG(1) and INFOG(20) the operations and entries that the analysis expects of it, the
-latter in millions where it is negative. With a Schur complement all are of what it is the complement of, and with ICNTL(26) = 0 so are
-solves. petsc4py has neither Schur complements nor analyses alone: PETSc's own library is called.
+Parameters as in its users' guide: INFOG(1) is the status of a factorisation, ICNTL(14) the workspace beyond the estimate of the analysis,
+INFOG(12) the number of negative pivots of a symmetric factorisation, ICNTL(7) and INFOG(7) the requested and the used ordering, ICNTL(33)
+enables the determinant, RINFOG(12) is its mantissa. RINFOG(1) and INFOG(20) are the estimated operations and entries, the latter in
+millions if negative. With a Schur complement all refer to the eliminated block, and with ICNTL(26) = 0 so do solves. petsc4py has neither
+Schur complements nor separate analyses, so that PETSc's library is called directly.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from petsc4py import PETSc
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 
-#: Types of PC that solve exactly.
+#: Types of PC that are factorisations.
 FACTORISATIONS = ("cholesky", "lu")
 #: MUMPS has at most so much workspace beyond its estimate; a matrix that needs more is better not factorised.
 #: [convention; per cent; test_mumps.py::test_workspace_has_an_end]
 MOST_WORKSPACE = 2000
-#: Ends of a factorisation that lacked workspace: for integers, for entries, for messages that were sent and received.
+#: Status of factorisations that lacked workspace: for integers, for entries, for messages that were sent and received.
 SHORT_OF_WORKSPACE = (-8, -9, -17, -20)
-#: The option by which the determinant is told.
+#: The option that enables the determinant.
 TELLS_SIGN = {"mat_mumps_icntl_33": 1}
-#: The option by which unknowns are ordered by approximate minimum fill.
+#: The option for ordering by approximate minimum fill.
 MINIMUM_FILL = {"mat_mumps_icntl_7": 2}
 
 
 def solves(pc: PETSc.PC) -> bool:
-    """Whether it is MUMPS that a preconditioner factorises with."""
+    """Whether a preconditioner is a factorisation by MUMPS."""
     return bool(pc.getType() in FACTORISATIONS and pc.getFactorSolverType() == "mumps")
 
 
 def more_workspace(pc: PETSc.PC) -> dict[str, Any]:
-    """PETSc's options by which a factorisation that lacked workspace gets twice as much; none if it did not, or has had enough.
+    """PETSc's options that double the workspace of a failed factorisation; empty if it did not lack workspace, or at the limit.
 
-    On several ranks MUMPS works in the order in which messages come: its estimate does not always do, for the same matrix.
+    On several ranks the order of messages varies, so that MUMPS' estimate is not always sufficient, even for the same matrix.
     """
     if not solves(pc):
         return {}
@@ -54,14 +54,14 @@ def more_workspace(pc: PETSc.PC) -> dict[str, Any]:
 
 
 def is_negative(pc: PETSc.PC) -> bool:
-    """Whether the determinant of what was factorised with ``TELLS_SIGN`` is negative."""
+    """Whether the determinant of a matrix factorised with ``TELLS_SIGN`` is negative."""
     return bool(pc.getFactorMatrix().getMumpsRinfog(12) < 0.0)
 
 
 def is_indefinite(pc: PETSc.PC, space: Nodes | None = None) -> bool:
-    """Whether a symmetric factorisation has negative pivots; not told if it is not MUMPS that made it (collective among other fields).
+    """Whether a symmetric factorisation by MUMPS has negative pivots; otherwise False (collective in mixed problems).
 
-    Multipliers of other fields of ``space``, such as pressures, are expected to make one each.
+    Multipliers in other fields of ``space``, such as pressures, are expected to have one negative pivot each.
     """
     if not (solves(pc) and pc.getType() == "cholesky"):
         return False
@@ -70,7 +70,7 @@ def is_indefinite(pc: PETSc.PC, space: Nodes | None = None) -> bool:
 
 @cache
 def _petsc() -> Any:
-    """PETSc's library if it has what Schur complements and analyses take, or None."""
+    """PETSc's library if it has the functions for Schur complements and analyses, or None."""
     library = ctypes.CDLL(PETSc.__file__)
     arguments = {
         "MatFactorSetSchurIS": 2, "MatFactorCreateSchurComplement": 3, "MatDenseGetArrayRead": 2, "MatDestroy": 1,
@@ -84,17 +84,17 @@ def _petsc() -> Any:
 
 
 def condenses(pc: PETSc.PC) -> bool:
-    """Whether a preconditioner factorises with MUMPS, which can leave some unknowns then and make their Schur complement."""
+    """Whether a preconditioner is a factorisation by MUMPS that supports Schur complements."""
     return solves(pc) and _petsc() is not None
 
 
 def solves_with_schur_complement(comm: MPI.Comm) -> bool:
-    """Whether PETSc solves with a factorisation that has a Schur complement: on several ranks those after 3.18 do not."""
+    """Whether PETSc solves with a factorisation that has a Schur complement: after version 3.18 not on several ranks."""
     return comm.size == 1 or PETSc.Sys.getVersion() < (3, 19)
 
 
 class Expected(NamedTuple):
-    """What a factorisation is expected to take.
+    """Estimated cost of a factorisation.
 
     Attributes:
         flops: floating-point operations.
@@ -106,13 +106,13 @@ class Expected(NamedTuple):
 
 
 def expected(pc: PETSc.PC, A: PETSc.Mat) -> Expected:
-    """What factorising a matrix as a PC is made to is expected to take, by the matrix's pattern (collective)."""
+    """Estimated cost of factorising a matrix with the options of a PC, from the matrix's pattern (collective)."""
     library, alone = _petsc(), PETSc.PC().create(pc.comm)
     alone.setOptionsPrefix(pc.getOptionsPrefix())
     alone.setType(pc.getType())
     alone.setOperators(A)
     factors = _factors(alone)
-    # MatFactorInfo is less than this many numbers
+    # MatFactorInfo has fewer numbers
     info = (ctypes.c_double * 32)()
     _check(library.MatFactorInfoInitialize(info))
     if pc.getType() == "cholesky":
@@ -125,7 +125,7 @@ def expected(pc: PETSc.PC, A: PETSc.Mat) -> Expected:
 
 
 def _factors(pc: PETSc.PC) -> PETSc.Mat:
-    """The factors that a PC is going to make by MUMPS, with its options (collective)."""
+    """The factor matrix of a PC, to be computed by MUMPS, with its options (collective)."""
     pc.setFactorSolverType("mumps")
     pc.setFactorSetUpSolverType()
     factors = pc.getFactorMatrix()
@@ -134,16 +134,16 @@ def _factors(pc: PETSc.PC) -> PETSc.Mat:
 
 
 def schur_complement(pc: PETSc.PC, left: Ints) -> Array | None:
-    """Factorise all unknowns but some (collective).
+    """Factorise all unknowns except some, and compute the Schur complement of these (collective).
 
-    The PC then solves with them, and gives zero at those left, where ``solves_with_schur_complement``.
+    If ``solves_with_schur_complement``, the PC then solves with the factorised block, and returns zero at the other unknowns.
 
     Args:
-        pc: of a type that factorises, with a matrix, not yet set up.
-        left: global numbers of those to be left, rank by rank.
+        pc: of a factorising type, with a matrix, not yet set up.
+        left: global numbers of this rank's unknowns in the Schur complement.
 
     Returns:
-        On rank 0 the Schur complement of all that were left, and nothing ``(0, 0)`` on others; None if MUMPS fails.
+        The Schur complement on rank 0, an empty array ``(0, 0)`` on other ranks; None if MUMPS fails.
     """
     library, comm = _petsc(), pc.comm.tompi4py()
     every = np.concatenate(comm.allgather(left)).astype(PETSc.IntType)
@@ -166,12 +166,12 @@ def schur_complement(pc: PETSc.PC, left: Ints) -> Array | None:
 
 
 def _check(error: int) -> None:
-    """Raise what a function of PETSc returned."""
+    """Raise the error that a function of PETSc returned, if any."""
     if error:
         raise PETSc.Error(error)
 
 
 def how_it_ended(pc: PETSc.PC) -> str:
-    """What MUMPS says of a factorisation that failed, for a message; empty where it is not MUMPS, or where it did not fail."""
+    """Status of a failed factorisation by MUMPS, for a message; empty for other solvers, or without failure."""
     ended = pc.getFactorMatrix().getMumpsInfog(1) if solves(pc) else 0
     return f" (MUMPS: INFOG(1) = {ended})" if ended < 0 else ""

@@ -258,7 +258,7 @@ def forces_of(config: Configuration, eq: UnitingEquations, multipliers: Array) -
 def unite(
     config: Configuration, declared: Sequence[LinearEquations], free: Bools, contactors: Sequence[Indices], load: Any, at: float
 ) -> UnitedRows:
-    """Equations of users among contactors ``(n,)`` of several contacts, with the load that a problem is handed (collective)."""
+    """Equations of users for a problem with these contactors ``(n,)`` of several contacts, and its load (collective)."""
     spared = np.zeros(config.n_owned, dtype=bool)
     for nodes in contactors:
         spared[nodes] = True
@@ -266,7 +266,7 @@ def unite(
 
 
 def _grows(b: Any, loaded: Collection[fem.Constant]) -> bool:
-    """Whether a value is approached along with the Dirichlet values."""
+    """Whether a value is ramped with the Dirichlet values."""
     if isinstance(b, fem.Constant):
         return not any(b is constant for constant in loaded)
     return not callable(b)

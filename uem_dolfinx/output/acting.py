@@ -1,4 +1,4 @@
-"""What is prescribed at points of the undeformed bodies, and what acts there, for sketches."""
+"""Prescribed values, loads and springs at points of the undeformed bodies, for sketches."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 @dataclass(frozen=True)
 class Acting:
-    """What is prescribed at points, or acts there, on rank 0.
+    """Prescribed values, loads or springs of one kind at points, on rank 0.
 
     Attributes:
         kind: ``"held"``, ``"prescribed"``, ``"value"`` of a scalar field, ``"load"``, ``"body load"``, ``"velocity"``, ``"spring"``,
-            ``"equation"``, ``"turn"``, which is a moment or a rotation, or ``"arm"``, from a node of a rigid part to its point.
-        name: what the legend calls it.
-        at: places ``(n, gdim)``.
-        vectors: components that are held as ones, else displacements, forces or velocities ``(n, k)``.
+            ``"equation"``, ``"turn"`` for a moment or a rotation, or ``"arm"``, from a node of a rigid part to its point.
+        name: label in the legend.
+        at: positions ``(n, gdim)``.
+        vectors: 1 for held components, or displacements, forces or velocities ``(n, k)``.
         outward: outward unit normals there, zero off the surface ``(n, gdim)``.
     """
 
@@ -40,14 +40,14 @@ class Acting:
 
 
 class Actions:
-    """Finds what acts, as it is now.
+    """Collects present prescribed values, loads and springs.
 
     Args:
-        problem: the scene.
-        outside: of its bodies.
+        problem: the problem.
+        outside: surface of its bodies.
 
     Attributes:
-        found: so far, on rank 0.
+        found: items collected so far, on rank 0.
     """
 
     def __init__(self, problem: UnitedProblem, outside: Outside):
@@ -56,13 +56,13 @@ class Actions:
         self.found: list[Acting] = []
 
     def act(self, kind: str, name: str, at: Array, vectors: Array, outward: Array | None = None) -> None:
-        """Note what acts at places of this rank (collective)."""
+        """Collect an item at positions of this rank (collective)."""
         found = self._outside.gather(at, vectors, np.zeros_like(at) if outward is None else outward)
         if found is not None and len(found[0]):
             self.found.append(Acting(kind, name, *found))
 
     def conditions(self) -> Bools:
-        """Note what Dirichlet conditions hold and prescribe; which facets outside are held in all components ``(m,)`` (collective)."""
+        """Collect Dirichlet conditions; returns the mask of surface facets that are held in all components ``(m,)`` (collective)."""
         found, largest = [], 0.0
         for bc in self.problem.bodies.bcs:
             mask, wanted = np.zeros((2, len(self.problem.u.x.array)))
@@ -91,7 +91,7 @@ class Actions:
         return clamped
 
     def _other_fields(self, mask: Array) -> None:
-        """Note where other fields than the displacement are prescribed, from which unknowns are ``(n,)`` (collective)."""
+        """Collect prescribed values of other fields than the displacement, from a mask of the unknowns ``(n,)`` (collective)."""
         functions = self.config.functions()
         if len(functions) > 1:
             copies = {name: fem.Function(f.function_space) for name, f in functions.items()}
@@ -105,7 +105,7 @@ class Actions:
                     self._note("value", f"prescribed value of {name.replace('_', ' ')}", values > 0.5, values)
 
     def _note(self, kind: str, name: str, where: Bools, vectors: Array) -> None:
-        """Note what is said of owned vertices outside, or of those inside where it is of no others; ``where`` as ``vectors``."""
+        """Collect vectors at owned vertices on the surface, or inside if none is on the surface; ``where`` masks ``vectors``."""
         some = self._outside.owned & where.any(axis=1)
         outside = some & self._outside.normals.any(axis=1)
         if reduced(self.comm, int(outside.sum())):
@@ -113,7 +113,7 @@ class Actions:
         self.act(kind, name, self._outside.X[some], vectors[some], self._outside.normals[some])
 
     def points(self) -> None:
-        """Note forces and springs at points (collective)."""
+        """Collect forces and springs at points (collective)."""
         points = self.problem.bodies.points
         for one, nodes in points.parts if points is not None else ():
             force, stiffness = one.force_and_stiffness(self.gdim)
@@ -122,7 +122,7 @@ class Actions:
             self.act(*(("load", "point load") if stiffness is None else ("spring", "spring")), at, vectors)
 
     def bodies(self, loads: tuple[Array, Array]) -> None:
-        """Note loads on surfaces ``(n_owned, gdim)`` and others, and velocities of bodies (collective)."""
+        """Collect loads on surfaces and body loads ``(n_owned, gdim)`` each, gravity and velocities of bodies (collective)."""
         config, dynamics, n = self.config, self.problem.dynamics, self.config.n_owned
         normals = fem.Function(compat.function_space(self.config.mesh, 1, (self.gdim,)))
         normals.x.array[:] = self._outside.normals.ravel()
@@ -157,7 +157,7 @@ class Actions:
         self.act("velocity", "velocity", config.X[:n][some], velocity[some])
 
     def couplings(self) -> None:
-        """Note parts that move rigidly, and what acts at their points (collective)."""
+        """Collect rigid parts, with loads and prescribed motions of their points (collective)."""
         for one in self.problem.couplings:
             role = f"the part of the RigidCoupling of '{one.name}'"
             X, point = self.config.X[nodes_at(self.config, one.where, role)], one.point

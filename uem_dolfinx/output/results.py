@@ -1,4 +1,4 @@
-"""Results to keep: files for ParaView and a history in CSV."""
+"""Result files: fields for ParaView and a history in CSV."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.time_steps import TimeStep
 
-#: Endings of VTX files, by the rank of what is in them.
+#: Endings of VTX files, by the rank of the tensors in them.
 ENDINGS = ("scalars", "vectors")
 
 
@@ -45,20 +45,20 @@ class HistoryWriter(Closing, given.Sealed):
     Args:
         path: name of the file; its folder is made.
         problem: source of the rows.
-        reaction: part of the mesh whose reaction is written, ``reaction_x`` ..., as ``UnitedProblem.reaction`` takes it; or several
+        reaction: part of the mesh whose reaction is written, ``reaction_x`` ..., as in ``UnitedProblem.reaction``; or several parts
             by name, ``reaction_NAME_x`` ...
-        columns: functions without arguments by the name of their column, called on all ranks once here and after every step; they
-            return a number, or a vector, whose columns are ``NAME_x`` ... if it has as many components as the displacement, else
+        columns: functions without arguments by column name, called on all ranks once here and after every step. They return a
+            number, or a vector, whose columns are ``NAME_x`` ... if it has as many components as the displacement, else
             ``NAME_0`` ...
         resume: keep the rows of an existing file up to the present step, and append to them; False moves the file to a folder
-            ``NAME.1``, or the next number, and begins a new one.
+            ``NAME.1``, or the next number, and starts a new file.
 
     Raises:
         OutputError, CheckpointError, ValueError: see ``CsvTable``.
         InputError, InputTypeError, UserFunctionError: if a column cannot be computed.
     """
 
-    #: Whose table it is, for messages.
+    #: Owner of the table in messages.
     _whose = "a HistoryWriter"
 
     def __init__(
@@ -87,22 +87,22 @@ class HistoryWriter(Closing, given.Sealed):
             raise
         #: Time of the last row.
         self._last = self.table.last.get(names[0], -np.inf)
-        #: Steps of the problem that the file knew all about when it was gone on with.
+        #: Last step contained in a resumed file, -1 for a new file.
         self._known = problem.progress.steps if self.table.last else -1
 
     def write(self, step: LoadStep | TimeStep | float) -> None:
-        """Append a row, unless the file that is gone on with has it (collective).
+        """Append a row, unless a resumed file has it (collective).
 
         Args:
-            step: a converged step; or its factor or time alone, which leaves the number of iterations empty.
+            step: a converged step; or only its factor or time, so that the number of iterations is empty.
         """
         self.append(step, self.clock(step))
 
     def clock(self, step: LoadStep | TimeStep | float) -> float:
-        """Factor or time of a step that is to be written (collective).
+        """Factor or time of a step to write (collective).
 
         Raises:
-            InputError, InputTypeError: if it has none, it is not finite, differs from rank to rank, or is a time before the last one.
+            InputError, InputTypeError: if it is missing, not finite, different on the ranks, or a time before the last one.
             ValueError, CheckpointError: see ``CsvTable.check``.
         """
         self.table.check()
@@ -120,7 +120,7 @@ class HistoryWriter(Closing, given.Sealed):
         return time
 
     def append(self, step: LoadStep | TimeStep | float, time: float) -> None:
-        """Append the row of a step, unless the file that is gone on with has it (collective)."""
+        """Append the row of a step, unless a resumed file has it (collective)."""
         if self._progress.steps <= self._known:
             return
         self._last = time
@@ -147,14 +147,14 @@ class TableOfResults(HistoryWriter):
 class ResultsWriter(Closing, given.Sealed):
     """Time series of results: fields for ParaView and the history.
 
-    Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv`` as ``HistoryWriter`` does, ``PATH_pairs.csv`` too, and where
-    DOLFINx has ADIOS2 ``PATH_vectors.bp`` and ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, as
-    ``field_1``; for every contact its pressure, gap, status and force, and the heat flux; and those in ``fields``. XDMF holds nodal
-    values at the nodes of the mesh only: a displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
+    Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv`` and ``PATH_pairs.csv`` as in ``HistoryWriter``, and, if DOLFINx
+    has ADIOS2, ``PATH_vectors.bp`` and ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, e.g. ``field_1``; for
+    every contact its pressure, gap, status, force and heat flux; and ``fields``. XDMF has nodal values at the nodes of the mesh only,
+    so that a displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
 
-    After every step XDMF and CSV are complete. Results that are there already are never overwritten: they are moved to the folder
-    ``PATH.1``, or the next number, with a warning, unless a run goes on from a checkpoint with ``resume=True``. A run that still
-    writes them keeps writing there, and other runs cannot resume them until it has closed them or ended::
+    After every step XDMF and CSV are complete. Existing results are never overwritten: they are moved to the folder ``PATH.1``, or the
+    next number, with a warning, unless a run restarts from a checkpoint with ``resume=True``. A run that still writes them continues
+    there, and other runs cannot resume them until it has closed them or ended::
 
         with uem.Checkpoint("out/run.uem") as checkpoint:
             checkpoint.begin(problem.state())
@@ -164,17 +164,17 @@ class ResultsWriter(Closing, given.Sealed):
 
     Args:
         path: name of the files without ending; its folder is made.
-        problem: what is written.
+        problem: problem whose results are written.
         fields: further UFL expressions by name, scalar, vector or tensor; one value per cell, in XDMF only.
         reaction: see ``HistoryWriter``.
-        columns: likewise.
-        vtx: whether to write VTX; None does where DOLFINx can.
+        columns: see ``HistoryWriter``.
+        vtx: whether to write VTX; None writes it if DOLFINx can.
         resume: append to existing XDMF and CSV files: the steps up to the checkpoint are kept, later ones are replaced. VTX files
             cannot be resumed: new steps are written to ``PATH_vectors.1.bp``, or the next number. Without files, or if no
-            checkpoint was read, new files are begun.
+            checkpoint was read, new files are started.
 
     Raises:
-        InputError, InputTypeError: for no path, no problem, or fields that are no UFL expressions by name.
+        InputError, InputTypeError: for an invalid path or problem, or fields that are no UFL expressions by name.
         MissingBackendError: if ``vtx`` is True and DOLFINx was built without ADIOS2.
         OutputError: if the files cannot be written (previous steps are kept), or if another run is still writing the files to
             resume.
@@ -215,7 +215,7 @@ class ResultsWriter(Closing, given.Sealed):
         refuse_shared(self._name(".csv"), comm, TableOfResults._whose)
         self._history = partial(TableOfResults, self._name(".csv"), problem, reaction=reaction, columns=columns)
         self._wants_vtx = compat.has_vtx() if vtx is None else vtx
-        #: A run that no checkpoint has put forward has nothing to go on with, which is known for sure at the first step.
+        #: Whether it is still open if a checkpoint is read; without one, there is nothing to resume at the first step.
         self._undecided = resume and not (problem.progress.resumed or problem.progress.steps)
         if not resume:
             self._make_way()
@@ -225,7 +225,7 @@ class ResultsWriter(Closing, given.Sealed):
         return self._stem.with_name(self._stem.name + ending)
 
     def _make_way(self) -> None:
-        """Keep the results of another run aside (collective)."""
+        """Move results of another run to a folder (collective)."""
 
         def move() -> None:
             self._stem.parent.mkdir(parents=True, exist_ok=True)
@@ -241,7 +241,7 @@ class ResultsWriter(Closing, given.Sealed):
         on_rank_0(self.problem.comm, f"the results {self._stem} cannot be written", move)
 
     def _open(self, resume: bool) -> None:
-        """Begin the files, or go on with them (collective)."""
+        """Start new files, or resume existing ones (collective)."""
         progress = self.problem.progress
         self.history = self._history(resume=resume)
         nodal, cellwise = list(self._nodal.values()), list(self._cellwise.values())
@@ -257,7 +257,7 @@ class ResultsWriter(Closing, given.Sealed):
         self._vtx: list[Any] | None = None
 
     def _open_vtx(self) -> list[Any]:
-        """VTX files, beside those that are there (collective)."""
+        """New VTX files, with names that are not in use (collective)."""
         opened, comm, degree = [], self.problem.comm, self.problem.config.degree
         # a file holds Functions of one element
         alike = [u for u in self._sources().values() if compat.lagrange_degree(u.function_space) == degree]
@@ -285,14 +285,14 @@ class ResultsWriter(Closing, given.Sealed):
         return found
 
     def write(self, step: LoadStep | TimeStep | float) -> None:
-        """Append the present state, unless the files that are gone on with have it (collective).
+        """Append the present state, unless resumed files have it (collective).
 
         Args:
             step: a converged step, or a load factor or time; it becomes the time in the files.
 
         Raises:
             OutputError: if it cannot be written.
-            InputError, InputTypeError: if ``step`` has no time, or one that is not finite, differs from rank to rank, or falls.
+            InputError, InputTypeError: if the time of ``step`` is missing, not finite, different on the ranks, or before the last one.
             CheckpointError: if a checkpoint was read after the writer had been made with ``resume=True``.
             ValueError: after ``close``.
         """
@@ -320,7 +320,7 @@ class ResultsWriter(Closing, given.Sealed):
         self.history.append(step, time)
 
     def close(self) -> None:
-        """Close all files (collective where there are VTX files)."""
+        """Close all files (collective with VTX files)."""
         self.history.close()
         self._xdmf.close()
         for writer in self._vtx or []:
@@ -329,7 +329,7 @@ class ResultsWriter(Closing, given.Sealed):
 
 
 def refuse_others(step: Any, problem: UnitedProblem) -> None:
-    """Raise InputError for a step that another problem has made."""
+    """Raise InputError for a step of another problem."""
     number = getattr(step, "_of_problem", 0)
     if number and number != problem.progress.number:
         raise InputError(
@@ -341,7 +341,7 @@ def _check_fields(fields: Any, mesh: Any) -> None:
     """Refuse fields that are no UFL expressions by name, on a mesh.
 
     Raises:
-        InputTypeError, InputError, SpaceError: naming the first bad one.
+        InputTypeError, InputError, SpaceError: names the first invalid field.
     """
     given.kind("fields", fields, fields is None or isinstance(fields, Mapping), "UFL expressions by name, as a dict, or None")
     for name, field in (fields or {}).items():
@@ -356,14 +356,14 @@ def _check_fields(fields: Any, mesh: Any) -> None:
 
 
 def clock(step: LoadStep | TimeStep | float) -> float:
-    """Load factor or time of a step; InputTypeError for what has none."""
+    """Load factor or time of a step; InputTypeError for objects without one."""
     known = isinstance(step, (TimeStep, LoadStep, int, float, np.number))
     given.kind("step", step, known, "a step of load_steps or time_steps, or its factor or time")
     return float(step.time if isinstance(step, TimeStep | LoadStep) else step)
 
 
 def contact_suffixes(contacts: Sequence[Contact | GeneralContact]) -> list[str]:
-    """What tells the contacts apart in names of fields and columns; nothing where there is but one."""
+    """Suffixes of the contacts in names of fields and columns; empty for a single contact."""
     if len(contacts) == 1:
         return [""]
     names = ["_" + re.sub(r"\W+", "_", contact.name).strip("_") for contact in contacts]

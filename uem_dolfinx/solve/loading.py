@@ -1,7 +1,7 @@
-"""What a problem's load drives: Constants, as terms of forms or as prescribed values, by one rule for all kinds of steps.
+"""The load of a problem: Constants in forms or prescribed values, with one rule for all kinds of steps.
 
-A Constant that the load sets has the value of the load factor or time wherever it acts. Other prescribed values are ramped over load
-steps, from the displacement at which these begin.
+A Constant that the load sets has the value of the load factor or time wherever it is used. Other prescribed values are ramped over load
+steps, from the displacement at their beginning.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class ByFunction:
         function: as declared.
 
     Attributes:
-        at: argument of its last call since the last step; None without one.
-        last: argument of its last call of all.
+        at: argument of its last call since the last step, or None.
+        last: argument of its last call, or None.
     """
 
     def __init__(self, function: Callable[[float], None]):
@@ -51,7 +51,7 @@ def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
     """The load as a function of the factor or the time, or as Constants and their values, each numbers or a function; or None.
 
     Raises:
-        InputTypeError, InputError: naming what it is instead.
+        InputTypeError, InputError: for other objects and values.
     """
     expected = "a scalar Constant, a dictionary of Constants and their values, a function of the load factor or time, or None"
     if isinstance(load, fem.Constant):
@@ -74,10 +74,10 @@ def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
 
 
 def set_loads(comm: MPI.Comm, load: Any, at: float) -> None:
-    """Set what a problem's ``load`` sets at a load factor or time; None sets nothing (collective).
+    """Apply a problem's ``load`` at a load factor or time; None sets nothing (collective).
 
     Raises:
-        InputError, InputTypeError: where the value of a Constant is no finite number, or numbers of another shape.
+        InputError, InputTypeError: if the value of a Constant is not finite, or of another shape.
         UserFunctionError: if a function raises.
     """
     if isinstance(load, Mapping):
@@ -103,9 +103,9 @@ def _fitting(constant: fem.Constant, value: Any) -> Any:
 
 
 def bring_load(problem: Any, at: float) -> None:
-    """Set a problem's load to a factor or time where it is not there yet (collective).
+    """Set a problem's load to a factor or time, unless it is already set (collective).
 
-    A function that was last called with it is not called again: what the script has moved since then stays.
+    A function that was last called with this argument is not called again, so that later changes by the script are kept.
     """
     load = problem.load
     if isinstance(load, ByFunction) and load.last == at:
@@ -117,14 +117,14 @@ def bring_load(problem: Any, at: float) -> None:
 
 
 def forget_load(problem: Any) -> None:
-    """Let the loads that have been set be those of the committed state: the next ``solve`` takes its own."""
+    """Mark the present loads as loads of the committed state: the next ``solve`` sets its own."""
     problem.set_at = None
     if isinstance(problem.load, ByFunction):
         problem.load.at = None
 
 
 def set_by_load(load: Any, bcs: Sequence[Any], n: int) -> Bools:
-    """Unknowns ``(n,)`` whose Dirichlet values are Constants that a load sets; a function as load tells of none."""
+    """Mask of unknowns ``(n,)`` whose Dirichlet values are Constants set by a load; all False for a function as load."""
     constants = list(load) if isinstance(load, Mapping) else []
     kept, found = [np.array(forms.values_of(c)) for c in constants], np.zeros((2, n))
     try:
@@ -140,13 +140,13 @@ def set_by_load(load: Any, bcs: Sequence[Any], n: int) -> Bools:
 
 
 def ramped(load: Any, bcs: Sequence[Any], start: Array, wanted: Array, fraction: float) -> Array:
-    """Unknowns ``(n,)`` on their way from ``start`` to ``wanted``, but for Dirichlet values that the load sets."""
+    """Unknowns ``(n,)`` interpolated from ``start`` to ``wanted``, except Dirichlet values that the load sets."""
     if fraction >= 1.0:
         return wanted
     return np.where(set_by_load(load, bcs, len(wanted)), wanted, start + fraction * (wanted - start))
 
 
-# -- Constants that nothing follows ----------------------------------------------------------------------------------------
+# -- Constants without effect ----------------------------------------------------------------------------------------------
 
 #: Objects within objects that are looked into for a Constant.
 #: [bound; objects; test_loads.py::test_a_constant_that_nothing_follows]
@@ -154,17 +154,17 @@ DEPTH = 4
 
 
 def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load", beside: Sequence[Any] = ()) -> None:
-    """Refuse Constants in a load that nothing of the problem follows (collective).
+    """Refuse Constants in a load that do not occur in the problem (collective).
 
     Args:
         problem: a ``UnitedProblem``.
-        load: what ``check_load`` returned.
-        bcs: Dirichlet conditions that the Constants may be values of.
-        what: the load is, for the message.
-        beside: other objects and functions that may hold them, as those of a step.
+        load: as returned by ``check_load``.
+        bcs: Dirichlet conditions, whose values may be the Constants.
+        what: name of the load in the message.
+        beside: other objects and functions that may contain them, e.g. objects in a step.
 
     Raises:
-        InputError: naming the first of them.
+        InputError: names the first of them.
     """
     if not isinstance(load, Mapping):
         return
@@ -187,12 +187,12 @@ def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load",
 
 
 def holds(one: Any, c: fem.Constant | fem.Function) -> bool:
-    """Whether an object is a Constant or a Function, or holds it in its attributes, items, terms, or what a function reads."""
+    """Whether an object is a given Constant or Function, or contains it in attributes, items, terms, or variables of a function."""
     return _holds(one, c, DEPTH, set())
 
 
 def _holds(one: Any, c: fem.Constant | fem.Function, depth: int, seen: set[int]) -> bool:
-    """Likewise, with objects within it up to a depth."""
+    """As ``holds``, for nested objects up to a depth."""
     if one is c:
         return True
     if (
@@ -221,7 +221,7 @@ def _holds(one: Any, c: fem.Constant | fem.Function, depth: int, seen: set[int])
         inside = [one.func, *one.args, *one.keywords.values()]
     else:
         inside = list(getattr(one, "__dict__", {}).values())
-    # items of a list lie as deep as the list
+    # items of a list have the depth of the list
     flat = isinstance(one, (list, tuple, set, Mapping))
     return any(_holds(part, c, depth if flat else depth - 1, seen) for part in inside)
 

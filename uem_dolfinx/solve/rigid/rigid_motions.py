@@ -1,6 +1,6 @@
-"""Rigid motions of bodies: which of them conditions and contacts leave open, which are loaded, what holds the neutral ones.
+"""Rigid motions of bodies: open motions under conditions and contacts, loaded motions, and supports of the neutral ones.
 
-Matrices are sparse: a motion that nothing resists is of one body, and others are of bodies that touch each other.
+Matrices are sparse: a motion that nothing resists concerns a single body, and others concern bodies that touch each other.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class RigidMotions:
     Args:
         config: configuration of the displacement.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
-        finite: whether bodies turn by finite rotations, not by linearised ones.
+        finite: whether rotations of bodies are finite, not linearised.
 
     Attributes:
-        share: part that the largest force along an open motion was of all forces when ``load`` was last asked.
+        share: largest force along an open motion relative to the sum of all forces, at the last call of ``load``.
     """
 
     def __init__(self, config: Configuration, free: Bools, finite: bool):
@@ -61,14 +61,14 @@ class RigidMotions:
         np.maximum.at(radius, own, np.linalg.norm(config.X[: config.n_owned] - self.middle[own], axis=1))
         self.comm.Allreduce(MPI.IN_PLACE, radius, op=MPI.MAX)
         self.radius: Array = radius
-        #: Modes that are no motions of rigid bodies: of axisymmetric ones all but the shift along the axis.
+        #: Modes that are no rigid-body motions: in axisymmetry all except the translation along the axis.
         self._strained = [0, 2] if config.axisymmetric else []
         self._supports: tuple[Array, Bools] | None = None
-        #: Motions that forces of the form resist, as those of springs, body by body; None where none was asked for.
+        #: Motions that forces of the form resist, e.g. springs, for each body; None if not determined.
         self._springs: Array | None = None
-        #: Motions that the conditions leave open, a sparse matrix ``(n_motions, k)``; where bodies turn little always the same.
+        #: Motions that the conditions leave open, a sparse matrix ``(n_motions, k)``; constant for linearised rotations.
         self._unheld: Any | None = None
-        #: Velocities of the owned nodes in the modes of their bodies, where bodies turn little; None before they were asked for.
+        #: Velocities of the owned nodes in the modes of their bodies, constant for linearised rotations; None until needed.
         self._drawn: Array | None = None
         self.share = 0.0
 
@@ -76,7 +76,7 @@ class RigidMotions:
 
     @property
     def _places(self) -> Array:
-        """Where the owned nodes are that a motion takes along ``(n_owned, gdim)``."""
+        """Positions of the owned nodes for the modes ``(n_owned, gdim)``: present, or of reference if rotations are linearised."""
         return (self.config.x if self.finite else self.config.X)[: self.config.n_owned]
 
     def _middles(self) -> Array:
@@ -86,7 +86,7 @@ class RigidMotions:
         return np.asarray(sums[:, 1:] / sums[:, :1])
 
     def _modes(self, x: Array, body: Ints) -> Array:
-        """Velocities of points ``x (n, gdim)`` of bodies ``(n,)`` in each of their own modes ``(n, n_modes, gdim)``."""
+        """Velocities of points ``x (n, gdim)`` of bodies ``(n,)`` in each mode of their body ``(n, n_modes, gdim)``."""
         modes = rigid_velocities((x - self.middle[body]) / self.radius[body][:, None])
         modes[:, self._strained] = 0.0
         return modes
@@ -99,17 +99,17 @@ class RigidMotions:
 
     @property
     def n_modes(self) -> int:
-        """Rigid-body modes of one body."""
+        """Number of rigid-body modes of one body."""
         return 3 if self.config.gdim == 2 else 6
 
     def _spread(self, values: Array, body: Ints, row: Ints | None = None, number: int | None = None) -> Any:
-        """Rows in all motions: sums of rows in the modes of one body each.
+        """Rows in all motions, as sums of rows in the modes of single bodies.
 
         Args:
             values: rows in the modes of a body ``(n, n_modes)``.
-            body: which one ``(n,)``.
-            row: that each belongs to ``(n,)``, with their ``number``; None numbers them.
-            number: of rows.
+            body: of each row ``(n,)``.
+            row: number of the sum that each row belongs to ``(n,)``; None for separate rows.
+            number: of sums.
 
         Returns:
             Sparse matrix ``(number, n_motions)``.
@@ -124,7 +124,7 @@ class RigidMotions:
         return csr_matrix((values.ravel(), (np.repeat(row, n), column)), shape=(number, self.count * n))
 
     def rates(self, equations: UnitingEquations) -> Any:
-        """How fast each motion opens the gap of each equation, a sparse matrix ``(m, n_motions)`` (collective)."""
+        """Rate of the gap of each equation in each motion, a sparse matrix ``(m, n_motions)`` (collective)."""
         config, g = self.config, self.config.gdim
         if self.finite:
             self.middle = self._middles()
@@ -139,14 +139,14 @@ class RigidMotions:
         """Orthonormal motions that neither conditions nor equations resist, a sparse matrix ``(n_motions, k)`` (collective).
 
         Args:
-            rates: of this rank's equations ``(m, n_motions)`` where the bodies are now, or None.
+            rates: of this rank's equations ``(m, n_motions)`` at the present positions, or None.
         """
         if self.finite and rates is None:
             self.middle = self._middles()
         if self.finite or self._unheld is None:
             body, modes, _ = self._held()
             resisted = reduced(self.comm, self._products(body, modes, modes))
-            # the bodies resist them themselves
+            # the stiffness of the bodies resists these modes
             resisted[:, self._strained, self._strained] = 1.0
             if self._springs is not None:
                 resisted += self._springs
@@ -166,13 +166,13 @@ class RigidMotions:
         return (free @ by_block(resisted, least)).tocsc()
 
     def ask_stiffness(self, K: PETSc.Mat) -> None:
-        """Take motions that K resists, as springs in a form do, as held (collective).
+        """Treat motions that K resists, e.g. by springs in a form, as held (collective).
 
-        With the modes R of a body and the work D of each on the diagonal of K, these are the eigenvectors of ``D^-1/2 R'KR D^-1/2`` whose
-        eigenvalues are no rounding.
+        With the modes R of a body and the work D of each on the diagonal of K, these are the eigenvectors of ``D^-1/2 R'KR D^-1/2`` with
+        eigenvalues above rounding.
 
         Args:
-            K: tangent of the bodies; one that is not finite tells nothing.
+            K: tangent of the bodies; ignored if it is not finite.
         """
         config, unknowns, own = self.config, self.config.unknowns, self._body[: self.config.n_owned]
         modes, size = self._modes(self._places, own), config.n_owned * config.gdim
@@ -188,7 +188,7 @@ class RigidMotions:
         if not np.isfinite(sums).all():
             return
         G, D = np.split(sums.reshape(self.count, self.n_modes, -1), [self.n_modes], axis=2)
-        # a body without stiffness, as one that a coupling makes rigid, has no work
+        # the work is zero for a body without stiffness, e.g. one that a coupling makes rigid
         S = np.sqrt(D / np.maximum(D.max(axis=1, keepdims=True), np.finfo(float).tiny))
         scale = np.where(D > 0, 1.0 / np.sqrt(np.where(D > 0, D, 1.0)), 0.0)
         values, vectors = np.linalg.eigh(0.5 * (G + G.transpose(0, 2, 1)) * scale * scale.transpose(0, 2, 1))
@@ -200,21 +200,21 @@ class RigidMotions:
         return bool(self.open_motions(None).shape[1])
 
     def _held(self) -> tuple[Ints, Array, tuple[Ints, Ints]]:
-        """Components with a Dirichlet condition: bodies ``(n,)``, how their modes move them ``(n, n_modes)``, nodes and components."""
+        """Components with a Dirichlet condition: bodies ``(n,)``, velocities in the modes ``(n, n_modes)``, nodes and components."""
         i, c = np.nonzero(~self.free)
         body = self._body[i]
         return body, self._modes(self._places[i], body)[np.arange(len(i)), :, c], (i, c)
 
     def _products(self, body: Ints, a: Array, b: Array) -> Array:
-        """Sums of the products of rows of ``a (n, j)`` and ``b (n, k)`` body by body ``(count, j, k)``."""
+        """Sums of the products of rows of ``a (n, j)`` and ``b (n, k)`` for each body ``(count, j, k)``."""
         sums = sums_of_rows(body, (a[:, :, None] * b[:, None, :]).reshape(len(a), a.shape[1] * b.shape[1]), self.count)
         return sums.reshape(self.count, a.shape[1], b.shape[1])
 
     def following(self, prescribed: Array) -> Array:
-        """The motion that follows the Dirichlet conditions by least squares; what they leave open rests (collective).
+        """The motion that follows the Dirichlet conditions by least squares, zero along open motions (collective).
 
         Args:
-            prescribed: increments of the owned nodes, those of free components aside ``(n_owned, gdim)``.
+            prescribed: increments of the owned nodes; free components are ignored ``(n_owned, gdim)``.
         """
         if self.finite:
             self.middle = self._middles()
@@ -228,7 +228,7 @@ class RigidMotions:
 
         Args:
             residual: ``F`` at the owned nodes ``(n_owned, gdim)``.
-            among: forces beside which they count ``(n_owned, gdim)``; None takes the residual itself.
+            among: forces whose sum is returned ``(n_owned, gdim)``; None for the residual.
         """
         own = self._body[: self.config.n_owned]
         work = -np.einsum("nmg,ng->nm", self._own_modes(), residual)
@@ -239,7 +239,7 @@ class RigidMotions:
         return total, scale
 
     def load(self, motions: Array, residual: Array, among: Array | None = None) -> Array:
-        """Force along the loaded ones of some motions, as a motion; zero if none is loaded (collective).
+        """Force along those of the given motions that are loaded, as a motion; zero if no motion is loaded (collective).
 
         Args:
             motions: sparse matrix ``(n_motions, k)``.
@@ -253,7 +253,7 @@ class RigidMotions:
         along = np.asarray(motions.T @ total)
         self.share = float(np.abs(along).max(initial=0.0) / scale) if scale > 0 else 0.0
         force = motions @ np.where(np.abs(along) > LOADED * scale, along, 0.0)
-        # bodies that are held stay where they are, to the last bit
+        # held bodies do not move, to the last bit
         return np.where(np.abs(force) > OPEN**2 * np.abs(force).max(initial=0.0), force, 0.0)
 
     def field(self, motion: Array) -> Array:
@@ -263,9 +263,9 @@ class RigidMotions:
         return np.asarray(np.einsum("nmg,nm->ng", self._own_modes(), parts[own]))
 
     def part(self, motions: Array, du: Array) -> Array:
-        """What an increment ``(n_owned, gdim)`` holds of some motions ``(n_motions, k)``, of the same shape (collective).
+        """Part of an increment ``(n_owned, gdim)`` along some motions ``(n_motions, k)``, of the same shape (collective).
 
-        Without it the increment does not depend on the supports: bodies stay where they are along neutral motions.
+        Without this part the increment does not depend on the supports, and bodies do not move along neutral motions.
         """
         from scipy.sparse.linalg import spsolve
 
@@ -278,7 +278,7 @@ class RigidMotions:
         return np.asarray(fields @ spsolve(gram, along)).reshape(du.shape)
 
     def ways(self, motion: Array) -> Array:
-        """How far nodes go in a motion, ghosts included ``(n_local, gdim)``."""
+        """Displacements of nodes in a motion, ghosts included ``(n_local, gdim)``."""
         config, g = self.config, self.config.gdim
         parts = motion.reshape(self.count, self.n_modes)
         body = self._body
@@ -288,17 +288,17 @@ class RigidMotions:
         turns = np.array([rotation_matrix(_turn(angles)) for angles in parts[:, g:] / self.radius[:, None]]) - np.eye(g)
         return np.asarray(np.einsum("nab,nb->na", turns[body], x - self.middle[body]) + parts[body, :g])
 
-    # -- what keeps the system regular -------------------------------------------------------------------------------------
+    # -- supports ----------------------------------------------------------------------------------------------------------
 
     def supports(self, motions: Any, equations: UnitingEquations, left: Bools | None = None) -> Bools:
-        """Components of owned nodes that hold neutral motions without any reaction ``(n_owned, gdim)`` (collective).
+        """Mask of components of owned nodes that hold neutral motions without reaction ``(n_owned, gdim)`` (collective).
 
-        One component per motion, each where what the earlier ones of its bodies leave open moves it most.
+        One component per motion: the one with the largest velocity in the motions that earlier supports leave open.
 
         Args:
             motions: sparse matrix ``(n_motions, k)``.
-            equations: whose nodes are spared.
-            left: components that rigid couplings do not eliminate ``(n_owned, gdim)``; None for all.
+            equations: their nodes are not used as supports.
+            left: mask of components that rigid couplings do not eliminate ``(n_owned, gdim)``; None for all.
         """
         if not motions.shape[1]:
             return np.zeros((self.config.n_owned, self.config.gdim), dtype=bool)
@@ -311,7 +311,7 @@ class RigidMotions:
 
         config, g, comm = self.config, self.config.gdim, self.comm
         pins = np.zeros((config.n_owned, g), dtype=bool)
-        # motions of bodies that touch each other make a group
+        # motions of bodies that touch each other form a group
         terms = motions.tocoo()
         moved = csr_matrix((np.ones(terms.nnz), (terms.row // self.n_modes, terms.col)), shape=(self.count, motions.shape[1]))
         group, place, number = blocks_of(moved.T @ moved)
@@ -322,7 +322,7 @@ class RigidMotions:
         allowed[equations.node] = False
         i, c = np.nonzero(allowed)
         own, of = own[i], of_body[own[i]]
-        # last bits of places differ from partition to partition
+        # rounding of positions depends on the partition
         places = np.round(config.X[i] / (SAME_PLACE * config.size))
         order = np.lexsort([c, *places.T[::-1]])
         rows = np.zeros((len(i), place.max(initial=-1) + 1))
@@ -333,7 +333,7 @@ class RigidMotions:
             largest = np.zeros(len(number))
             np.maximum.at(largest, of, size)
             comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-            # of equally good ones the first by its place in the drawing, whichever rank has it
+            # of equally good components the first by its reference position, on any rank
             good = order[(size >= (1.0 - OPEN) * largest[of])[order] & (number[of] > k)[order]]
             first = good[np.unique(of[good], return_index=True)[1]]
             offers = [((*places[j], c[j]), of[j], comm.rank, j, rows[j] / size[j]) for j in first]
@@ -349,11 +349,11 @@ class RigidMotions:
         return pins
 
     def forget_supports(self) -> None:
-        """Let the supports be chosen anew: a step must not depend on how those before it were found."""
+        """Choose the supports anew, so that a step does not depend on earlier steps."""
         self._supports = None
 
     def error(self, motion: Array) -> FloatingBodyError:
-        """What to tell about a loaded motion that nothing stops: which body moves most, and how."""
+        """The error for an unrestrained loaded motion: the body that moves most, and its motion."""
         g = self.config.gdim
         parts = motion.reshape(self.count, self.n_modes)
         b = int(np.abs(parts).max(axis=1).argmax())
@@ -374,11 +374,11 @@ class RigidMotions:
         )
 
     def thrown(self, ways: Array, most: float) -> ThrownBodyError:
-        """What to tell about a body that contact has pushed by ``ways (n_owned, gdim)`` and holds no more (collective).
+        """The error for a body that contact has pushed by ``ways (n_owned, gdim)`` and no longer holds (collective).
 
         Args:
-            ways: of the owned nodes.
-            most: how far is far.
+            ways: displacements of the owned nodes.
+            most: largest displacement that is accepted.
         """
         size, own = np.linalg.norm(ways, axis=1), self._body[: self.config.n_owned]
         far = np.zeros(self.count)
@@ -399,7 +399,7 @@ def _turn(angles: Array) -> Array:
 
 
 def blocks_of(H: Any) -> tuple[Ints, Ints, Ints]:
-    """Diagonal blocks that a symmetric sparse matrix ``(n, n)`` falls into: each row's block, its place in it ``(n,)``, and their sizes."""
+    """Diagonal blocks of a symmetric sparse matrix ``(n, n)``: each row's block and its position there ``(n,)``, and block sizes."""
     from scipy.sparse.csgraph import connected_components
 
     number, block = connected_components(H, directed=False)
@@ -410,11 +410,11 @@ def blocks_of(H: Any) -> tuple[Ints, Ints, Ints]:
 
 
 def by_block(H: Any, make: Callable[[Array], tuple[Array, Bools]]) -> Any:
-    """Columns made of the diagonal blocks that a symmetric sparse matrix falls into.
+    """Columns computed from the diagonal blocks of a symmetric sparse matrix.
 
     Args:
         H: the matrix ``(n, n)``.
-        make: columns ``(b, s, s)`` of blocks ``(b, s, s)`` of one size, and which of them are kept ``(b, s)``.
+        make: returns columns ``(b, s, s)`` of blocks ``(b, s, s)`` of one size, and the mask of columns to keep ``(b, s)``.
 
     Returns:
         Sparse matrix ``(n, k)``.

@@ -1,6 +1,6 @@
-"""What nothing holds or resists, and what rounding hides: a body on which a field has flown off, and one that has no stiffness.
+"""Errors for unrestrained fields, unknowns without stiffness, and equilibria hidden by rounding.
 
-Rigid motions of bodies are looked at before they fly, by ``floating``; other fields when they have.
+Rigid motions of bodies are checked before they move, by ``floating``; other fields after they have diverged.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from uem_dolfinx.solve.bodies.norms import ratio
 
 
 def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
-    """What to tell about a field that is solved for and grows without end: on which body it is largest (collective).
+    """The error for a field that diverges, with the body on which it is largest (collective).
 
     Args:
-        bodies: where it is as large as it became.
-        field: its number among the fields of a mixed problem, the displacement's 0; else 0.
-        residual: part of the forces that its equations leave.
+        bodies: with the diverged field.
+        field: number of the field in a mixed problem, 0 for the displacement; otherwise 0.
+        residual: relative residual of its equations.
     """
     config, comm, values = bodies.config, bodies.comm, np.abs(bodies.u.x.array)
     if config.unknowns.mixed:
@@ -49,21 +49,21 @@ def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
 
 
 def refuse_bare(bodies: Bodies, P: Restriction, Q: Restriction, more: PETSc.Mat | None) -> None:
-    """Refuse a united system in which nothing resists some unknowns (collective).
+    """Refuse a constrained system with unknowns without stiffness (collective).
 
     Args:
         bodies: with the tangent K.
-        P: of trial.
-        Q: of test.
-        more: what contacts and couplings add to K; None for nothing.
+        P: trial restriction.
+        Q: test restriction.
+        more: terms of contacts and couplings in addition to K, or None.
 
     Raises:
-        InputError: naming the first body and node.
+        InputError: names the first body and node.
     """
     if bodies.tangent.bare is None:
         return
     config, comm, n = bodies.config, bodies.comm, bodies.config.n_owned
-    # a row with any entry passes on something of what is moved at random
+    # random unknowns: rows with any entry give non-zero forces
     du = P.expand(config.vector(np.random.default_rng(comm.rank).uniform(1.0, 2.0, P.used.shape) * P.used))
     y = forms.product(bodies.tangent.K, du)
     if more is not None:
@@ -87,7 +87,7 @@ def refuse_bare(bodies: Bodies, P: Restriction, Q: Restriction, more: PETSc.Mat 
 
 
 def no_precision(norm: float, rounding: float, real: float) -> PrecisionError:
-    """What to tell about a residual of this norm, and this rounding, beside forces of the norm ``real``."""
+    """The error for a residual of this norm with this rounding, relative to forces of the norm ``real``."""
     return PrecisionError(
         f"rounding hides the equilibrium: the residual stays at {norm:.3g}, which is {ratio(norm, real):.1g} of the forces at work, "
         f"while rounding of the stiffest parts alone makes {rounding:.3g}: their stiffness times displacement is too large beside the "

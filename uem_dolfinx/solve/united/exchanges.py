@@ -1,13 +1,12 @@
-"""Which of the wrong contactors change sides, exchange by exchange and iteration by iteration.
+"""Choice of the contactors that violate their conditions and change state, in each active-set change and each iteration.
 
-A state that comes again is noticed when it does. Another rule takes over then; where none is left, an error names the contactors that
-change sides for ever.
+A repeated state is detected, and another rule is then used. If no rule is left, an error names the contactors that cycle.
 
-Where all contactors of a body that friction alone holds slip, Coulomb's forces of one contact may balance those of another whatever they
-are: the united matrix is singular, and what it predicts is far beyond the bodies. From the state before, limits of friction are then held
-at what the forces along the normal make them, as in Tresca's law, whose matrix is symmetric; without the curvature of contact the problem
-is convex. The forces that follow make the next limits, until these settle, and Coulomb's law goes on from there. So they are once in every
-linearised problem where contactors would go one by one.
+If all contactors of a body held only by friction slip, the Coulomb forces of one contact may balance those of another at any magnitude:
+the constrained matrix is singular, and predicted motions are huge. Then, from the previous state, the friction limits are fixed at the
+values given by the normal forces, as in Tresca's law. The matrix is then symmetric, and without the curvature of contact the problem is
+convex. Its normal forces give new limits, until these have converged; then Coulomb's law is used again. Limits are also fixed once in
+every linearised problem in which contactors would otherwise change one by one.
 """
 
 from __future__ import annotations
@@ -66,13 +65,13 @@ NAMED = 3
 
 @dataclass(frozen=True)
 class _Visit:
-    """A state that the bodies have been in on the way to equilibrium.
+    """A state visited before equilibrium.
 
     Attributes:
-        state: what tells it from others.
+        state: its fingerprint.
         norm: of the residual.
         patterns: of every pair.
-        changed: contactors of every pair that have been exchanged since the one before.
+        changed: masks of contactors of every pair that have changed state since the previous visit.
     """
 
     state: object
@@ -82,18 +81,18 @@ class _Visit:
 
 
 class Exchanges:
-    """Chooses among the wrong contactors of all pairs; all methods are collective.
+    """Chooses among the contactors that violate their conditions, in all pairs; all methods are collective.
 
     Args:
         pairs: of all contacts.
 
     Attributes:
-        straight: whether the linearised problem has to do without the curvature of contact.
-        convex: whether the curvature of contact has to do without what could make the tangent indefinite: Newton's method does not
-            leave a path that has come to a limit point, past which the bodies find another equilibrium downhill.
-        frozen: whether contactors that stick or slip do so until the bodies have moved, when they are asked again.
-        held: whether limits of friction are held.
-        again: whether the linearised problem is to be solved with other limits of friction, even without changes of sides.
+        straight: whether the linearised problem neglects the curvature of contact.
+        convex: whether terms of the curvature that could make the tangent indefinite are neglected. Beyond a limit point, Newton's
+            method does not leave the path by itself; with a convex tangent the bodies reach another equilibrium of lower energy.
+        frozen: whether stick and slip states are fixed until the bodies have moved.
+        held: whether limits of friction are fixed.
+        again: whether the linearised problem must be solved again with other limits of friction, even without changes of state.
     """
 
     def __init__(self, pairs: Sequence[Interface]):
@@ -105,7 +104,7 @@ class Exchanges:
         """Forget the states of other steps."""
         self._visits: list[_Visit] = []
         self._rounds = 0
-        #: Norm of the residual since when the curvature is convex; zero for the next.
+        #: Whether the curvature is convex, and the residual norm at which it became so; zero to set it at the next visit.
         self.convex, self._from = False, 0.0
         self.begin()
 
@@ -113,13 +112,13 @@ class Exchanges:
         """Begin another linearised problem."""
         self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
         self._number, self._alone, self._rule = 0, 0, Rule.ALL
-        #: Whether limits have been held, and the last states without a mechanism.
+        #: Whether limits are and have been fixed, and the last states without a mechanism.
         self.held = self._were_held = False
         self._known: list[tuple[PairState, Pivot] | None] | None = None
         for pair in self._pairs:
             if pair.friction is not None:
                 pair.friction.hold_limits(None)
-        #: Contactors exchanged in this problem, and of these by the present rule.
+        #: Contactors that have changed state in this problem, and by the present rule.
         self._changed, self._lately = self._none(), self._none()
 
     @property
@@ -134,16 +133,16 @@ class Exchanges:
     def choose(
         self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0
     ) -> list[Violations] | None:
-        """Which of the wrong contactors are exchanged now; None if the linearised problem is solved.
+        """Contactors that change state now; None if the linearised problem is solved.
 
         Args:
-            violated: of every pair.
+            violated: violations of every pair.
             gaps: that decide on contact, of every pair ``(n,)``.
-            curved: whether the linearised problem has a curvature of contact.
-            way: how far a node goes at most, a length.
+            curved: whether the linearised problem includes the curvature of contact.
+            way: largest displacement of a node, a length.
 
         Raises:
-            ConvergenceError, FrictionError: if no rule is left; it names the contactors that are wrong by turns.
+            ConvergenceError, FrictionError: if no rule is left; names the contactors that cycle.
         """
         comm = self._pairs[0].config.comm
         if self.frozen:
@@ -169,12 +168,12 @@ class Exchanges:
         chosen, rule = violated, self._rule if far else self._pivoting.choose(int(number), state)
         if far or (free and rule >= Rule.FIRST and not (self._were_held or self.frozen)):
             if curved:
-                # without curvature the problem with held limits is a convex one
+                # without curvature the problem with fixed limits is convex
                 self.straight = self.convex = True
             self._hold_limits()
             return [w.among(np.zeros_like(w.enter)) for w in violated]
         if rule >= Rule.FIRST and curved and not self.straight:
-            # with curvature the problem may have no solution, or several; without there is one
+            # with curvature the problem may have no solution or several; without curvature it has exactly one
             self._pivoting, self.straight, self.convex = Pivoting(), True, True
         elif rule == Rule.WORST:
             worst = reduced(comm, max(w.worst for w in violated), op=MPI.MAX)
@@ -205,7 +204,7 @@ class Exchanges:
             raise self._circle(self._lately)
 
     def _here(self, violated: Sequence[Violations]) -> list[tuple[PairState, Pivot] | None]:
-        """States of the pairs with friction, with the forces along the normal that are predicted."""
+        """States of the pairs with friction, with the predicted normal forces."""
         here: list[tuple[PairState, Pivot] | None] = []
         for pair, w in zip(self._pairs, violated):
             if pair.friction is None or not isinstance(w, FrictionViolations):
@@ -215,7 +214,7 @@ class Exchanges:
         return here
 
     def _hold_limits(self) -> None:
-        """Go back to the last state without a mechanism, and hold the limits that its forces make (collective)."""
+        """Return to the last state without a mechanism, and fix the limits given by its forces (collective)."""
         for pair, known in zip(self._pairs, self._known or ()):
             if pair.friction is not None and known is not None:
                 state, pair.friction.pivot = known
@@ -225,7 +224,7 @@ class Exchanges:
         self._solve_again()
 
     def _let_limits_follow(self, violated: Sequence[Violations]) -> None:
-        """Take the limits that held ones have led to, or Coulomb's law where these are near (collective)."""
+        """Update the fixed limits from the present forces, or return to Coulomb's law if they have converged (collective)."""
         self._known, each = self._here(violated), np.zeros(2)
         for pair, known in zip(self._pairs, self._known):
             if pair.friction is not None and known is not None:
@@ -244,7 +243,7 @@ class Exchanges:
         return [np.zeros(len(pair.nodes), dtype=bool) for pair in self._pairs]
 
     def _first(self, violated: Sequence[Violations]) -> list[Violations]:
-        """The first of the wrong contactors alone, with those at the same place of the same contact."""
+        """The first violating contactor by position, with contactors of the same contact at the same position."""
         config = self._pairs[0].config
         along = [pair.config.X[pair.nodes] @ ALONG[: config.gdim] for pair in self._pairs]
         first = np.cumsum([0, *(len(pair.members) for pair in self._pairs)])
@@ -257,16 +256,16 @@ class Exchanges:
         return [w.among((a <= at) & (which == k)) for which, w, a in zip(label, violated, along)]
 
     def visit(self, norm: float) -> bool:
-        """Note the state in which the bodies are, which is no equilibrium.
+        """Record the present state, which is no equilibrium.
 
         Args:
             norm: of the residual.
 
         Returns:
-            Whether it has come again, and contactors that go in and out of corners follow bends less closely from now on.
+            Whether the state is a repetition, and contactors that cycle at corners use averaged normals from now on.
 
         Raises:
-            ConvergenceError, FrictionError: if it has come again otherwise, naming the contactors that change.
+            ConvergenceError, FrictionError: for other repetitions if no rule is left; names the contactors that cycle.
         """
         if self.convex:
             self._from = self._from or norm
@@ -291,21 +290,21 @@ class Exchanges:
             return False
         self._visits, self._rounds = [], self._rounds + 1
         calmed = reduced(comm, any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
-        # no rule found the active set of the last linearised problem, and it has led back to the same state
+        # no rule has found the active set of the last linearised problem, and the same state was reached again
         if self._rounds == MOST_ROUNDS or (self.frozen and not calmed):
             raise self._circle(changed)
         return calmed
 
     def _state(self) -> tuple[int, ...]:
-        """What tells the present states of all contactors from others."""
+        """Fingerprint of the present states of all contactors."""
         return tuple(gathered(self._pairs[0].config.comm, self._pattern()))
 
     def _pattern(self) -> int:
-        """What tells the present states of this rank's contactors from others."""
+        """Fingerprint of the present states of this rank's contactors."""
         return zlib.crc32(b"".join(pair.pattern.tobytes() for pair in self._pairs))
 
     def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
-        """The error that names contactors ``(n,)`` of every pair."""
+        """The error for a cycle, with the names of contactors, marked in masks ``(n,)`` of every pair."""
         own = [
             (tuple(pair.config.X[pair.nodes[i]]), pair.name_at(int(i)), pair.config.describe(int(pair.nodes[i])))
             for pair, c in zip(self._pairs, changed)
@@ -322,7 +321,7 @@ class Exchanges:
 
 
 def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:
-    """Number of wrong contactors over all pairs and ranks (collective)."""
+    """Number of violating contactors over all pairs and ranks (collective)."""
     return int(reduced(pairs[0].config.comm, sum(w.count for w in violated))) if pairs else 0
 
 

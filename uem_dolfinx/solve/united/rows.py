@@ -1,4 +1,4 @@
-"""Uniting equations of all pairs brought together: where they can conflict, Q, and how conflicts are resolved."""
+"""Constraint equations of all pairs together: possible conflicts, Q, and the resolution of conflicts."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ if TYPE_CHECKING:
 
 
 class OverConstraints:
-    """How equations of several contacts can meet (collective).
+    """Shared nodes of the equations of several contacts (collective).
 
     Args:
         config: configuration of the displacement.
-        pairs: of all contacts; they are told whether their surfaces are contactor and target of each other.
-        linear: equations of users; None for none.
+        pairs: of all contacts; ``mutual`` is set if their surfaces are contactor and target of each other.
+        linear: equations of users, or None.
 
     Attributes:
         shared: whether a node is a contactor of several pairs.
         stacked: whether a node that is followed may itself be eliminated.
-        contestable: whether equations can conflict that follow each other in no ring.
+        contestable: whether equations can conflict even if they do not follow each other in a ring.
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None):
         self._unknowns = config.unknowns
-        # contacts that are treated together meet each other one by one
+        # joined contacts are compared one by one
         surfaces, which = _surfaces([one for pair in pairs for one in pair.members])
         follows = [followed_nodes(config, dofs) for dofs in surfaces]
         whole, pairs = pairs, [one for pair in pairs for one in pair.members]
@@ -62,11 +62,11 @@ class OverConstraints:
         config.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.LOR)
         meets = found[:-1].reshape(meets.shape)
         self.shared = bool(found[-1])
-        # bodies that follow each other in one order never follow each other both ways
+        # bodies that follow each other in one order never follow each other mutually
         ordered = np.array([pair.discretisation.ordered_by for pair in pairs])
         one_order = (ordered[:, None] == ordered) & (ordered[:, None] >= 0)
         both_ways = meets & meets.T & ~one_order
-        # what is tied as a whole never touches: its surfaces meet others beside it alone
+        # surfaces that are tied as a whole are never in contact; they share only edge nodes with other surfaces
         tied = np.array([pair.tie is not None and pair.tie.whole for pair in pairs], dtype=bool)
         refused = (both_ways & ~(tied[:, None] | tied)).any(axis=1)
         for pair, mutual, wrong in zip(pairs, both_ways.any(axis=1), refused):
@@ -79,7 +79,7 @@ class OverConstraints:
         self.stacked = bool(meets.any()) or any(pair.chained for pair in whole)
         self.contestable = self.shared or any(pair.discretisation.prescribed for pair in whole)
         if any(_united_fields(pair) for pair in pairs):
-            # temperatures of both sides stand in the same rows, and may be prescribed
+            # rows contain temperatures of both sides, which may be prescribed
             self.stacked = self.contestable = True
         self._n_linear = 0
         self._rigid = None if linear is None else linear.rigid
@@ -87,7 +87,7 @@ class OverConstraints:
             self._meet(config, linear.equations, contactors, follows)
 
     def _meet(self, config: Configuration, linear: UnitingEquations, contactors: Indices, follows: Sequence[Bools]) -> None:
-        """Take in how equations of users meet each other and those of contacts (collective)."""
+        """Include shared nodes of users' equations, among each other and with contacts (collective)."""
         self._n_linear = len(linear) - (0 if self._rigid is None else self._rigid.n_rows)
         eliminated = np.zeros(config.n_local, dtype=bool)
         eliminated[linear.node] = True
@@ -99,7 +99,7 @@ class OverConstraints:
         self.stacked, self.contestable = self.stacked or bool(followed), self.contestable or bool(at_contactors)
 
     def parted(self, equations: UnitingEquations) -> tuple[UnitingEquations, list[UnitingEquations]]:
-        """Equations as they can be told to be independent, and those of rigid couplings, which others speak of no more (collective)."""
+        """Equations without components that rigid couplings eliminate, and the equations of the rigid couplings (collective)."""
         if self._rigid is None:
             return equations, []
         last = np.arange(len(equations)) >= len(equations) - self._rigid.n_rows
@@ -108,12 +108,12 @@ class OverConstraints:
     def restrict(
         self, equations: UnitingEquations, free: Bools, prescribed: Array
     ) -> tuple[Restriction, IndependentEquations | None]:
-        """P or Q of equations, and how conflicts among them were resolved (collective).
+        """P or Q of equations, and the resolution of their conflicts (collective).
 
         Args:
-            equations: of all pairs together, and after them those of users.
-            free: components that are not held ``(n_rows, gdim)``.
-            prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
+            equations: of all pairs together, followed by the equations of users.
+            free: mask of free components ``(n_rows, gdim)``.
+            prescribed: increments prescribed by Dirichlet conditions ``(n_rows, gdim)``.
         """
         given, rigid = self.parted(equations)
         firm, g = np.arange(len(given)) >= len(given) - self._n_linear, prescribed.shape[1]
@@ -131,19 +131,19 @@ class OverConstraints:
 
 @dataclass(frozen=True)
 class Rows:
-    """Uniting equations of all pairs in one state, and what was made of them.
+    """Constraint equations of all pairs in one state, with P and Q.
 
     Attributes:
-        pairs: that have them.
-        equations: of each; those of users come after them in P and Q.
-        trial: all that P is made of; None where it is ``frictionless``.
-        independent: how conflicts were resolved; None if there could be none.
+        pairs: with equations.
+        equations: of each pair; in P and Q the equations of users follow.
+        trial: all equations of P; None if P is ``frictionless``.
+        independent: resolution of conflicts; None if there cannot be any.
         test: Q.
-        frictionless: Q as it is without the friction of contactors that slip, which closes the gaps as well.
-        heat: equations of temperatures by number of their pair, each of one field, which come after those of ``equations``, before those
-            of users.
-        rigid: couplings whose equations come last; None without any.
-        given: what Q was made of before it was rewritten for these; None without any.
+        frictionless: Q without the friction of slipping contactors; it also closes the gaps.
+        heat: equations of temperatures by number of their pair, each of one field; they come after ``equations`` and before the
+            equations of users.
+        rigid: rigid couplings, whose equations come last, or None.
+        given: equations of Q before they were rewritten for the rigid couplings, or None.
     """
 
     pairs: Sequence[Interface]
@@ -157,7 +157,7 @@ class Rows:
     given: UnitingEquations | None = None
 
     def of(self, pairs: Sequence[Interface]) -> list[Constraints]:
-        """Equations of each of all pairs."""
+        """Equations of each of these pairs; empty for pairs without equations."""
         known = {id(pair): own for pair, own in zip(self.pairs, self.equations)}
         none = np.zeros(0, np.int64)
         return [known.get(id(pair), pair.kinematics.gap_rows.select(none, pair.trial.active)) for pair in pairs]
@@ -165,17 +165,17 @@ class Rows:
 
 @dataclass(frozen=True)
 class BodyState(IterationState):
-    """``IterationState`` with the rows that it was made of, and what the direction of slip adds to tangent and residual."""
+    """``IterationState`` with its rows, and the terms of the slip directions in tangent (``added``) and residual (``held``)."""
 
     rows: Rows
     added: PETSc.Mat | None
     held: PETSc.Vec | None
 
     def with_pressures(self, K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
-        """The state with how heat changes with pressures, as far as they are forces of single contactors (collective).
+        """The state with the derivatives of heat by pressures, if pressures are forces of single contactors (collective).
 
         Args:
-            K: tangent of the bodies, whose rows at the contactors tell how contact forces change.
+            K: tangent of the bodies, whose rows at the contactors are the derivatives of contact forces.
             G: curvature of the contact, or None.
         """
         state, test, parts, first = self, self.test, [], 0
@@ -204,13 +204,13 @@ def make_rows(
 
     Args:
         over_constraints: of the pairs.
-        pairs: that have a contactor in question.
-        hold: free components ``(n_rows, gdim)``, for rows of the relative motions that contacts stop, and of all that they resist.
-        prescribed: increments that Dirichlet conditions ask for ``(n_rows, gdim)``.
-        linear: equations of users; None for none.
+        pairs: that may be in contact.
+        hold: returns the free components ``(n_rows, gdim)``, from the rows of motions that contacts bound, and of all that they resist.
+        prescribed: increments prescribed by Dirichlet conditions ``(n_rows, gdim)``.
+        linear: equations of users, or None.
 
     Raises:
-        FrictionError: if contactors wedge where several equations meet.
+        FrictionError: if contactors with several equations wedge.
     """
     rigid = [pair for pair in pairs if not pair.target.n_nodes]
     for pair in rigid if over_constraints.shared else ():
@@ -229,7 +229,7 @@ def make_rows(
             UnitingEquations.join([*parts, *users], g)
             for parts in ([e.resisting for e in equations], [e.stopping for e in equations])
         )
-    # the derivatives of the gaps tell which motions of a body nothing holds
+    # the derivatives of the gaps determine the open motions of a body
     free = hold(stopping, resisting)
     Q, independent = over_constraints.restrict(frictionless, free, prescribed)
     given = frictionless
@@ -260,30 +260,30 @@ def make_rows(
 
 
 def _surfaces(pairs: Sequence[Interface]) -> tuple[list[Indices], Ints]:
-    """Nodes of all targets, those of one surface once, and which of these each pair has ``(n_pairs,)``."""
+    """Nodes of all distinct target surfaces, and the index of each pair's surface ``(n_pairs,)``."""
     keys = [id(getattr(pair.target, "facets", pair)) if len(pair.whole.members) > 1 else id(pair) for pair in pairs]
     first = {key: pair.discretisation.followed for key, pair in reversed(list(zip(keys, pairs)))}
     return list(first.values()), np.array([list(first).index(key) for key in keys], dtype=np.int64)
 
 
 def joined(equations: UnitingEquations, more: list[UnitingEquations], block: int) -> UnitingEquations:
-    """Equations and others after them."""
+    """Equations, followed by more equations."""
     return UnitingEquations.join([equations, *more], block) if more else equations
 
 
 def _united_fields(pair: Interface) -> list[Heat]:
-    """Heat of those fields that are the same on both sides where the pair's surfaces touch."""
+    """Heat laws with perfect conductance, whose temperatures are equal on both sides of the contact."""
     return [heat for heat in pair.heats if heat.law.perfect]
 
 
 def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array | None) -> tuple[list[Traction], Array]:
-    """Contact forces of every pair, with the heat that goes through it, and multipliers of users' equations ``(m,)`` (collective).
+    """Contact forces and heat flow of every pair, and multipliers of users' equations ``(m,)`` (collective).
 
     Args:
-        pairs: of all contacts; those of the rows are told which of their equations are redundant.
+        pairs: of all contacts; redundant equations are marked in the pairs of the rows.
         rows: equations.
-        y: forces that were passed on by Q.
-        du: increment ``(n_owned, gdim)`` that they are predicted with; None where the bodies are now.
+        y: forces transferred by Q.
+        du: increment ``(n_owned, gdim)`` of a prediction; None for the present state.
     """
     n_rigid = 0 if rows.rigid is None else rows.rigid.n_rows
     lam, last = np.split(rows.test.multipliers(y), [len(rows.test.equations) - n_rigid])
@@ -314,11 +314,11 @@ def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test
 
     Args:
         pairs: of all contacts.
-        independent: how they were resolved without friction.
+        independent: their resolution without friction.
         test: rotated equations of all pairs.
 
     Raises:
-        FrictionError: naming the first contactor, of the first rank that has one, whose equations no longer tell its motion.
+        FrictionError: names the first contactor whose equations no longer determine its motion.
     """
     rotated = independent.rotated(test)
     _refuse_wedged(pairs, test, rotated.undetermined)
@@ -326,7 +326,7 @@ def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test
 
 
 def _refuse_wedged(pairs: Sequence[Interface], test: UnitingEquations, wedged: Bools) -> None:
-    """Raise a FrictionError of the first contactor with rotated equations that no longer tell its motion, on any rank (collective)."""
+    """Raise a FrictionError for the first contactor with rotated equations that no longer determine its motion (collective)."""
     bad, error = np.flatnonzero(wedged), None
     if len(bad):
         node = int(test.node[bad[0]])
@@ -341,9 +341,9 @@ def _refuse_wedged(pairs: Sequence[Interface], test: UnitingEquations, wedged: B
 def unbalanced(
     pairs: Sequence[Interface], F: PETSc.Vec, forces: Sequence[Traction], more: Array | None = None
 ) -> tuple[Array, Array]:
-    """What contact forces leave of the bodies' forces F, and these, at the owned nodes ``(n_owned, gdim)`` each (collective).
+    """The bodies' forces F minus contact forces, and F, at the owned nodes ``(n_owned, gdim)`` each (collective).
 
-    ``forces`` are those of every pair, ``more (n_owned, gdim)`` those of equations of users, None without any.
+    ``forces`` are the contact forces of every pair, ``more (n_owned, gdim)`` the forces of users' equations, or None.
     """
     config = pairs[0].config
     every = F.array_r.reshape(-1, config.gdim)[: config.n_owned].copy()
@@ -354,7 +354,7 @@ def unbalanced(
 
 
 def not_held() -> FrictionError:
-    """For bodies that friction does not hold."""
+    """The error for bodies that friction does not hold."""
     return FrictionError(
         "the loads drive a body over its target, and friction does not hold it: there is no equilibrium; hold it by a "
         "Dirichlet condition, give it inertia, or take less load"
@@ -362,7 +362,7 @@ def not_held() -> FrictionError:
 
 
 def several_answers() -> FrictionError:
-    """The refusal of an equilibrium between which and that without friction the united matrix was singular."""
+    """The error for an equilibrium whose matrix has a determinant of another sign than without friction."""
     return FrictionError(
         "friction leaves more than one answer: with these slipping contactors the determinant of Q'KP has another sign than "
         "without friction; take less friction, or stiffer bodies"

@@ -1,4 +1,4 @@
-"""The united system: bodies, contact pairs, P and Q together, as the ``newton.ContactMethod`` of elimination."""
+"""The constrained system: bodies, contact pairs, P and Q together, as the ``newton.ContactMethod`` of elimination."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class BodySystem:
 
     Args:
         bodies: without contact.
-        pairs: of all contacts, just made.
-        solver: of the united system.
+        pairs: of all contacts, newly made.
+        solver: of the constrained system.
         newton: ``"full"`` or ``"modified"``.
         consistent_tangent: whether the curvature of the contact is added to K.
-        linear: equations of users; None for none.
+        linear: equations of users, or None.
     """
 
     def __init__(
@@ -69,17 +69,17 @@ class BodySystem:
     ):
         self.bodies, self.solver = bodies, solver
         self.config, self.unknowns, self.comm = bodies.config, bodies.unknowns, bodies.comm
-        self._n = bodies.forces.size  # of the displacement's components here, which are the first of vectors
+        self._n = bodies.forces.size  # number of the displacement's components on this rank, which come first in vectors
         self.newton, self.consistent_tangent = newton, consistent_tangent
         solver.lasting = bodies.tangent.linear or newton == "modified"
-        self.curvature: PETSc.Mat | None = None  # of the contact in the last united matrix
+        self.curvature: PETSc.Mat | None = None  # of the contact in the last constrained matrix
         self._petrov_galerkin = False  # whether P differs from Q
-        #: The state that was settled last, if its united matrix has a negative determinant, or with other fields one of either sign.
+        #: The last state with a final active set, if its matrix has a negative determinant, or with other fields of either sign.
         self._not_unique: tuple[BodyState, bool] | None = None
         self._led = False  # whether the bodies have moved in this step
-        self._adrift = False  # whether the last exchange has let go of a body that loads drive
-        self._swept = False  # whether contactors that have slid off a thin target sweep past it, on the way to equilibrium
-        self._multipliers: Array = np.zeros(0)  # of the equations of users, as read last ``(m,)``
+        self._adrift = False  # whether the last change of the active set has released a loaded body
+        self._swept = False  # whether contactors that have slid off a thin target may pass it, before equilibrium is reached
+        self._multipliers: Array = np.zeros(0)  # of the equations of users, as last computed ``(m,)``
         self.take(pairs, linear)
         self.place()
         for pair in self.pairs:
@@ -88,11 +88,11 @@ class BodySystem:
             pair.activate_touching()
 
     def take(self, pairs: Sequence[Interface], linear: UserRows | None) -> None:
-        """Take these pairs and equations of users for all, under the bodies' present conditions, from the next step on (collective)."""
+        """Replace all pairs and equations of users, under the bodies' present conditions, from the next step on (collective)."""
         from uem_dolfinx.solve.bodies.far_apart import FarApart
 
         self.pairs, self.linear = list(pairs), linear
-        self._here: Rows | None = None  # where contactors were placed last, with the directions of slip; None before it is needed
+        self._here: Rows | None = None  # equations at the last projection, with its slip directions; None until needed
         self._look()
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         self.over_constraints = OverConstraints(self.config, self.pairs, linear)
@@ -100,14 +100,14 @@ class BodySystem:
         self.solver.condensed.beside = nodes_beside(self.config, self.pairs)
 
     def _look(self) -> None:
-        """Take the pairs of which any rank has a contactor in question now: the others are in no loop of an iteration."""
+        """Collect the pairs that may be in contact on any rank; iterations loop over these only."""
         self.near: list[Interface] = in_question(self.pairs)
         self._heats: list[Heat] = [heat for pair in self.near for heat in pair.heats]
 
-    # -- where the contactors stand --------------------------------------------------------------------------------------
+    # -- projection of contactors ----------------------------------------------------------------------------------------
 
     def place(self) -> None:
-        """Project the contactors where bodies and targets are now."""
+        """Project the contactors at the present positions of bodies and targets."""
         if self.linear is not None:
             self.linear.place()
         self._here = None
@@ -121,7 +121,7 @@ class BodySystem:
         self._look()
 
     def return_to_targets(self, bound: float) -> bool:
-        """Normal return [UEM, 4.2]: put active contactors back onto the moved targets (collective); see ``ContactMethod``."""
+        """Normal return [UEM, 4.2]: move active contactors back onto the moved targets (collective); see ``ContactMethod``."""
         if not self.pairs:
             return False
         assert self.bodies.stiffness is not None
@@ -134,7 +134,7 @@ class BodySystem:
         for k, (pair, way) in enumerate(zip(self.near, ways)):
             for j, rows in enumerate(pair.turns() if shared else [slice(None)]):
                 if shared and j + k > 0:
-                    # what another pair has returned is returned
+                    # nodes may have been returned by another pair already
                     pair.project()
                     way = pair.return_vectors()
                 self.config.shift(pair.nodes[rows], way[rows])
@@ -143,7 +143,7 @@ class BodySystem:
         return True
 
     def begin_step(self) -> None:
-        """Begin a step: bodies that only contact holds fall until they touch, others are asked what they would touch first."""
+        """Begin a step: bodies that only contact holds fall until they touch; for others, the first contact is predicted."""
         self._not_unique, self._led = None, False
         self.exchanges.begin_step()
         for pair in self.pairs:
@@ -156,7 +156,7 @@ class BodySystem:
         self._look()
 
     def end_step(self) -> None:
-        """Refuse an equilibrium that contacts and conditions do not agree about, or that is one of several (collective)."""
+        """Refuse an equilibrium with conflicting contacts and conditions, or one of several equilibria (collective)."""
         for pair in self.near:
             check_prescribed(pair)
         if self.linear is not None:
@@ -171,7 +171,7 @@ class BodySystem:
     # -- equations and forces --------------------------------------------------------------------------------------------
 
     def residual(self) -> PETSc.Vec:
-        """Forces of the bodies less loads of contacts, and friction that does not grow with the force along the normal (collective)."""
+        """Forces of the bodies minus loads of contacts and friction that is independent of the normal force (collective)."""
         F = self.bodies.residual
         for nodes, forces in filter(None, (*known_forces(pairs := self.near), *(pair.applied_forces() for pair in pairs))):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
@@ -180,17 +180,17 @@ class BodySystem:
         return F
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
-        """Where the contactors belong at the present displacement, and the equations that follow.
+        """The targets of the contactors at the present displacement, and their equations.
 
-        1. Take Q'F with the present equations.
-        2. In equilibrium, read the contact forces from F; on the way they are those that the last linearised problem predicted.
-        3. Let go of contactors past an end, and follow the others across bends, into corners and out of them.
-        4. Put those whose equations have changed where they now belong; let bodies that have lost their hold fall.
-        5. Take the equations that follow, Q'F with them, and which contactors break the conditions of contact.
+        1. Compute Q'F with the present equations.
+        2. In equilibrium, compute the contact forces from F; otherwise they are the prediction of the last linearised problem.
+        3. Release contactors past an end, and follow the others across bends, into corners and out of them.
+        4. Project contactors with changed equations again; let bodies that contact no longer holds fall.
+        5. Compute the new equations, Q'F with them, and the contactors that violate the contact conditions.
         """
         bodies, pairs, turning = self.bodies, self.near, self.linear is not None and self.linear.turning
         if bodies.stiffness is None and self.pairs:
-            # what tells tension from rounding
+            # for the rounding of contact forces
             bodies.update_tangent()
         F, rounding = self.residual(), self.rounding()
         with timed("uniting equations"):
@@ -211,10 +211,10 @@ class BodySystem:
             here = [(pair, pair.stiffness_across(bodies.stiffness), bodies.rounding_at(pair.nodes)) for pair in pairs]
             found = [pair.violated(pair.gap, pair.traction, across, least, 0.0, self._swept) for pair, across, least in here]
             violated = count(pairs, found)
-            # one that is let go of falls, whatever the active set lacks
+            # a released body falls, even if the active set still changes
             unsettled = moved or (violated > 0 and not (at_rest and self.floating.adrift))
             wanting = not (at_rest and violated == 0 and not moved)
-            # the residual that a step begins with does not know how far conditions lead the bodies
+            # the residual at the beginning of a step does not include prescribed increments
             if wanting and pairs and self._led and self.exchanges.visit(first(self.unknowns.norms(residual))):
                 for pair in pairs:
                     pair.place_again()
@@ -244,7 +244,7 @@ class BodySystem:
         )
 
     def _rows_here(self) -> Rows:
-        """Equations where the contactors have been placed, with the directions of slip there (collective)."""
+        """Equations at the last projection, with its slip directions (collective)."""
         if self._here is None:
             for pair in self.near:
                 assert self.bodies.stiffness is not None
@@ -258,8 +258,8 @@ class BodySystem:
         return make_rows(self.over_constraints, self.near, hold, self.bodies.prescribed, self.linear)
 
     def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
-        """P, what the directions of slip add, the number of active contactors, and their largest gap (collective)."""
-        # where equations conflict, those of P might eliminate other components than those of Q
+        """P, terms of the slip directions in tangent and residual, number of active contactors, and their largest gap (collective)."""
+        # if equations conflict, P might eliminate other components than Q
         contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
         apart = None if contested else rows.trial
         self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
@@ -274,7 +274,7 @@ class BodySystem:
         return trial, *terms, int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
-        """The state in which contactors that gaps and forces, both to first order, show on the wrong side have changed (collective)."""
+        """The state with an active set changed where gaps and forces, both to first order, violate contact conditions (collective)."""
         if not self.pairs:
             return None
         state, du, left = problem.state, step.du, step.left
@@ -313,7 +313,7 @@ class BodySystem:
             if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen) if pair.asked]):
                 self.exchanges.start_again()
             rows = self._rows()
-            # a body that is let go has to fall first
+            # a released body has to fall first
             self._adrift = self.floating.adrift
             return self._with_rows(state, rows)
 
@@ -323,7 +323,7 @@ class BodySystem:
         return replace(state, trial=trial, test=rows.test, rows=rows, added=added, held=held, active=active, right=False)
 
     def _predicted_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
-        """What contact, friction and present forces add to ``F = K du`` (collective)."""
+        """``F = K du`` plus the terms of contact and friction, and the present forces (collective)."""
         for more in (self.curvature, state.added):
             if more is not None:
                 F.axpy(1.0, forms.product(more, du))
@@ -333,10 +333,10 @@ class BodySystem:
         return F
 
     def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
-        """How bodies slide without end under predicted forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
+        """Unbounded sliding of bodies under predicted forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
         if self.floating.motions is None or not any(pair.frictional for pair in self.pairs):
             return None
-        # known forces are among those of the contact
+        # contact forces include the known forces
         every = F + (self.bodies.residual - self.residual())
         more = None if self.linear is None else self.linear.forces(self._multipliers)
         return self.floating.slide(*united_rows.unbalanced(self.pairs, every, forces, more))
@@ -346,32 +346,32 @@ class BodySystem:
         return self._rows().test
 
     def _read_forces(self, rows: Rows, y: PETSc.Vec, du: Array | None = None) -> list[Traction]:
-        """Contact forces of every pair, from forces that were passed on (collective)."""
+        """Contact forces of every pair, from transferred forces y (collective)."""
         forces, self._multipliers = united_rows.read_forces(self.pairs, rows, y, du)
         return forces
 
     def _take(self, forces: list[Traction]) -> None:
-        """Hand the contact forces to the pairs."""
+        """Store the contact forces in the pairs."""
         for pair, own in zip(self.pairs, forces):
             pair.set_forces(own)
         if self.linear is not None:
             self.linear.multipliers = self._multipliers
 
     def rounding(self) -> float:
-        """Norm of the forces that rounding of the displacement, and of the active contactors' positions, can make (collective)."""
+        """Norm of the forces due to rounding of the displacement, and of the active contactors' positions (collective)."""
         active = [pair.nodes[pair.united] for pair in self.near]
         of_bodies = self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
         return of_bodies + FORCE_ROUNDING * sum(self.unknowns.norms_of(heat.sizes()) for heat in self._heats)
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
-        """``Q'F`` where the contactors were placed and the residual was assembled last, with the active set of ``state``.
+        """``Q'F`` of the last projection and the last assembled residual, with the active set of ``state``.
 
-        Q belongs to the present normals and slips: the old Q would take the turned contact forces for a residual.
+        Q uses the present normals and slips: with the old Q, rotated contact forces would count as residual.
         """
         return self._rows_here().test.transpose(self.residual())
 
     def accelerate(self) -> None:
-        """Find the acceleration that the bodies start with (collective)."""
+        """Find the initial acceleration of the bodies (collective)."""
         dynamics = self.bodies.dynamics
         if dynamics is not None and not dynamics.accelerated:
             self.place()
@@ -399,7 +399,7 @@ class BodySystem:
         self._adrift = False
 
     def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
-        """United matrix ``Q'KP`` of a state, and the right-hand side ``Q'(r - K c)`` (collective)."""
+        """Constrained matrix ``Q'KP`` of a state, and the right-hand side ``Q'(r - K c)`` (collective)."""
         if iteration is not None:
             self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
@@ -407,10 +407,10 @@ class BodySystem:
         state = state.with_pressures(K, self.curvature) if self._heats else state
         curvature = together(self.curvature, state.added)
         refuse_bare(self.bodies, P, Q, curvature)
-        # a modified Newton loop lets small changes of P pass
+        # modified Newton ignores changes of coefficients in P
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
         linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact
-        # momentum is kept exactly where solves can be
+        # in dynamics momentum is conserved exactly by exact solves
         passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
         return LinearisedProblem(
             state=state,
@@ -423,8 +423,8 @@ class BodySystem:
         )
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
-        """Unknowns dq, and ``du = P dq + c``, first of all nodes where motions or contactors untouched so far ask (collective)."""
-        # held limits follow what a solve predicts: it is as good as a direct one
+        """Unknowns dq, and ``du = P dq + c``, in all nodes if open motions or separated contacts need them (collective)."""
+        # friction limits follow predicted forces, which must then be as accurate as with a direct solver
         accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
         self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
@@ -434,16 +434,16 @@ class BodySystem:
         return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
 
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
-        """The increment in all unknowns, where the last solve was of those of the contact (collective)."""
+        """The increment in all unknowns, if the last solve was condensed onto the contact (collective)."""
         dq = self.solver.complete(step.dq)
         return step if dq is step.dq else step._replace(dq=dq, du=self.move(problem.state, dq))
 
     def forget(self) -> None:
-        """Let the next step assemble and factorise anew, as the first of a run does (collective)."""
+        """Let the next step assemble and factorise anew, like the first step of a run (collective)."""
         self.solver.forget()
 
     def move(self, state: IterationState, dq: PETSc.Vec) -> PETSc.Vec:
-        """``du = P dq + c``; bodies stay where they are along neutral motions."""
+        """``du = P dq + c``, without motion of bodies along neutral motions."""
         du = state.trial.expand(dq)
         du.axpy(1.0, state.trial.c)
         du.array[: self._n] = self.floating.without_open_motions(du.array_r[: self._n])
