@@ -13,7 +13,7 @@ class UEMError(Exception):
     """Root of every error this package raises on purpose."""
 
     def amend(self, more: str, instead: bool = False) -> None:
-        """Say more at the end of the message, ``instead`` of all advice, and no longer advise smaller steps, which do not help."""
+        """Append to the message, or replace all advice (``instead``), and remove the advice of smaller steps, which do not help."""
         smaller = "take smaller (load )?steps"
         if instead:
             self.args = (re.sub("[:;] (take|raise) [^;]*", "", str(self)),)
@@ -31,7 +31,7 @@ class InputTypeError(InputError, TypeError):
 
 
 class UserFunctionError(UEMError, RuntimeError):
-    """A function of the user's has raised an error, which is the cause of this one on the rank where it happened."""
+    """A function of the user has raised an error, which is the ``__cause__`` of this one on the rank where it happened."""
 
 
 class TagError(UEMError, KeyError):
@@ -95,7 +95,7 @@ class PrecisionError(UEMError, ArithmeticError):
 
 
 class InvertedElementError(UEMError, ArithmeticError):
-    """The displacement turns a cell inside out."""
+    """The displacement inverts a cell."""
 
 
 class EnergyGivenError(UEMError, ArithmeticError):

@@ -1,6 +1,6 @@
-"""Measures, matrices, vectors and functionals of forms, and what a reference cell consists of.
+"""Measures, matrices, vectors and functionals of forms, and topology of reference cells.
 
-Calls that are alike in all versions of DOLFINx but would have to be repeated by every caller.
+Calls that are the same in all versions of DOLFINx, but would have to be repeated by every caller.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def original_cells(domain: Any) -> npt.NDArray[np.int64]:
     try:
         return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
     except RuntimeError:
-        # a mesh made of another one may not know its input
+        # a mesh made from another one may have no input cells
         return np.zeros(0, dtype=np.int64)
 
 
@@ -58,13 +58,13 @@ def vertex_nodes(domain: Any) -> Indices:
 
 
 def expanded(form: ufl.Form) -> ufl.Form | None:
-    """A form with its derivatives taken; None where nothing is left."""
+    """A form with expanded derivatives; None if it is empty."""
     found = ufl.algorithms.expand_derivatives(form)
     return None if found.empty() else found
 
 
 def by_places(form: ufl.Form, domain: Any, direction: Any) -> ufl.Form | None:
-    """Derivative of a form along a change of the positions of a mesh's nodes; None where it does not depend on them.
+    """Derivative of a form along a change of the positions of a mesh's nodes; None if the form does not depend on them.
 
     All coordinates in the form become one object: UFL compares them by hashes that FFCx 0.5 changes where users compile forms.
     """
@@ -75,14 +75,14 @@ def by_places(form: ufl.Form, domain: Any, direction: Any) -> ufl.Form | None:
     return expanded(ufl.derivative(ufl.replace(form, found) if found else form, X, direction))
 
 
-#: Of forms that have been expanded: which integrals are left, and which Functions and Constants of these, by the forms' signatures.
+#: Numbers of the non-zero integrals of expanded forms, and of their Functions and Constants, by the forms' signatures.
 _left: dict[str, tuple[list[int], list[int], list[int]]] = {}
 
 
 def with_derivatives(form: ufl.Form) -> tuple[ufl.Form, list[Any]]:
-    """The integrals of a form in which something is left once derivatives are taken, and the Functions and Constants that is made of.
+    """The integrals of a form that do not vanish when derivatives are expanded, and their Functions and Constants.
 
-    The derivatives stay as they are written, for the compiler. Forms that are alike are expanded once in a process.
+    The derivatives are returned unexpanded, for the compiler. Equal forms are expanded once in a process.
     """
     key = form.signature()
     if key not in _left:
@@ -98,7 +98,7 @@ def with_derivatives(form: ufl.Form) -> tuple[ufl.Form, list[Any]]:
 
 
 def cells_of_facets(domain: Any, facets: npt.ArrayLike) -> tuple[Indices, Indices]:
-    """Cells of facets, ghosts included, and which of its cell's facets each is ``(k,)``; one that lies between two comes twice."""
+    """Cells of facets, ghosts included, and each facet's number in its cell ``(k,)``; interior facets occur twice."""
     topology, entities = domain.topology, np.asarray(facets, dtype=np.int32)
     tdim = topology.dim
     topology.create_connectivity(tdim - 1, tdim)
@@ -113,7 +113,7 @@ def cells_of_facets(domain: Any, facets: npt.ArrayLike) -> tuple[Indices, Indice
 
 
 def mesh_tags(domain: Any, dim: int, entities: npt.ArrayLike, values: npt.ArrayLike) -> Any:
-    """MeshTags of local entities in any order ``(n,)``, of equal ones the first, with one integer for all or for each ``(n,)``."""
+    """MeshTags of local entities in any order ``(n,)``, with one value for all or for each ``(n,)``; the first of duplicates counts."""
     indices = np.asarray(entities, dtype=np.int32).reshape(-1)
     numbers = np.broadcast_to(np.asarray(values, dtype=np.int32), indices.shape)
     unique, first = np.unique(indices, return_index=True)
@@ -175,7 +175,7 @@ def sum_ghosts(u: Any) -> None:
 
 
 def form(integrals: Any) -> Any:
-    """Compile a UFL form, or a nested sequence of them, for real arithmetic; one with two kinds of rules becomes a list of parts."""
+    """Compile a UFL form, or a nested sequence of forms, for real numbers; a form with two kinds of rules becomes a list of parts."""
     if not isinstance(integrals, ufl.Form):
         with kept():
             return fem.form(integrals, dtype=np.float64)
@@ -189,9 +189,9 @@ def _compiled(F: ufl.Form) -> Any:
 
 
 def _by_rules(F: ufl.Form) -> list[ufl.Form]:
-    """A form parted into what rules of one point integrate and the rest.
+    """A form split into integrals with one-point rules and other integrals.
 
-    In code for both, FFCx (0.5 to 0.11) takes values of Functions at the one point for those at every point.
+    In code for both, FFCx (0.5 to 0.11) uses the values of Functions at the one point for every point.
     """
     parts: dict[bool, list[Any]] = {}
     for integral in F.integrals():
@@ -200,7 +200,7 @@ def _by_rules(F: ufl.Form) -> list[ufl.Form]:
         parts.setdefault(one, []).append(integral)
     if len(parts) < 2:
         return [F]
-    # the part with cells first, since matrices get its pattern
+    # the part with cell integrals first, since it determines the pattern of matrices
     return [ufl.Form(own) for own in sorted(parts.values(), key=lambda own: all(i.integral_type() != "cell" for i in own))]
 
 
@@ -210,11 +210,11 @@ def parts_of(compiled: Any) -> list[Any]:
 
 
 def _of_sensible_degree(F: ufl.Form) -> ufl.Form:
-    """The form with a quadrature rule of degree ``DEGREES_ENOUGH`` where UFL would sum up the degrees of a quotient or logarithm.
+    """The form with quadrature rules of at most ``DEGREES_ENOUGH`` times the degree for quotients, logarithms and similar terms.
 
-    No rule integrates what is no polynomial of its Functions exactly. On quadrilaterals and hexahedra UFL's estimate for a neo-Hookean
-    law asks for 12 points in every direction at degree 1, and 22 at degree 2, where 3 and 5 leave an error below 1e-6 at strains of
-    30 %. Hoop strains, which are quotients by a radius, count as such in all cells. Rules that the measure names stay.
+    Integrands that are no polynomials are never integrated exactly. On quadrilaterals and hexahedra UFL's estimate for a neo-Hookean
+    law is 12 points in every direction at degree 1, and 22 at degree 2; 3 and 5 points have errors below 1e-6 at strains of 30 %.
+    Hoop strains are quotients by a radius and are treated in the same way in all cells. Rules given in the measure are kept.
     """
     if not F.integrals():
         return F
@@ -257,9 +257,9 @@ def _is_polynomial(integrand: Any) -> bool:
 
 
 def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
-    """The form with the same tags at all integrals of a kind, as UFL wants it, whatever each of them came with (collective).
+    """The form with the same tags for all integrals of a kind, as UFL requires (collective).
 
-    Also at those over everything, which have none: DOLFINx 0.9 takes them for others.
+    Integrals over the whole mesh, without tags, get them as well: DOLFINx 0.9 treats them as a separate kind otherwise.
     """
     if all(i.subdomain_data() is None for i in F.integrals()):
         return F
@@ -274,7 +274,7 @@ def _of_one_subdomain_data(F: ufl.Form) -> ufl.Form:
 
 
 def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-    """Integrals of one kind with MeshTags that number every overlap of those they came with, and these MeshTags (collective)."""
+    """Integrals of one kind with common MeshTags that number every overlap of their own MeshTags (collective)."""
     of = [[(i.subdomain_data(), n) for n in np.ravel(i.subdomain_id()) if n != "everywhere"] for i in integrals]
     pairs = list({(id(d), int(n)): (d, int(n)) for own in of for d, n in own}.values())
     entities = np.unique(np.concatenate([d.indices for d, _ in pairs]))
@@ -283,7 +283,7 @@ def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], l
     cpp_mesh = F.ufl_domain().ufl_cargo()
     known = sorted({tuple(row) for part in cpp_mesh.comm.allgather(rows.tolist()) for row in part})
     numbers = np.array([known.index(tuple(row)) + 1 for row in rows.tolist()], dtype=np.int32)
-    # what DOLFINx 0.5 and what newer ones take from the mesh
+    # attributes of the mesh that DOLFINx 0.5 and newer versions use
     domain = SimpleNamespace(_mesh=cpp_mesh, topology=SimpleNamespace(_cpp_object=cpp_mesh.topology))
     tags = mesh.meshtags(domain, pairs[0][0].dim, entities, numbers[which.ravel()] if len(entities) else numbers)
     column = {(id(d), n): k for k, (d, n) in enumerate(pairs)}
@@ -335,9 +335,9 @@ def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
 
 
 def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec:
-    """``(A + G) x`` of square matrices, of which the second may be missing (collective).
+    """``(A + G) x`` of square matrices; G may be None (collective).
 
-    The vector has the layout of ``x``; for ``A * x`` petsc4py makes a layout anew, which takes two more collective calls.
+    The vector has the layout of ``x``. For ``A * x`` petsc4py would make a new layout, with two more collective calls.
     """
     y = x.duplicate()
     A.mult(x, y)
@@ -347,7 +347,7 @@ def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec
 
 
 def free_petsc_garbage(comm: MPI.Comm) -> None:
-    """Free the PETSc objects that Python has let go of; until then PETSc keeps them (collective)."""
+    """Free the PETSc objects that Python has released; PETSc keeps them until then (collective)."""
     PETSc.garbage_cleanup(comm)
 
 
@@ -357,12 +357,12 @@ def values_of(m: fem.Constant | fem.Function) -> Any:
 
 
 def in_all_cells(F: ufl.Form, u: fem.Function, laws: bool = False) -> ufl.Form:
-    """A residual that couples unknowns in all cells, by nothing where it is not integrated: its tangent then has their diagonal.
+    """A residual with a zero term in all cells, so that the sparsity of the tangent includes every diagonal entry.
 
     Args:
-        F: residual; one that does not depend on u stays as it is.
+        F: residual; unchanged if it does not depend on u.
         u: unknowns.
-        laws: whether it depends on u by laws with history, too.
+        laws: whether it also depends on u by laws with history.
     """
     of_u = [i for i in F.integrals() if any(part is u for part in traverse_unique_terminals(i.integrand()))]
     some = of_u or (F.integrals() if laws else [])

@@ -1,4 +1,4 @@
-"""What a script needs beside DOLFINx, alike in all its versions: Dirichlet conditions and measures by tag, and integrals."""
+"""Helpers for scripts, the same for all versions of DOLFINx: Dirichlet conditions and measures by tag, and integrals."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def dirichlet(
     """Prescribe the displacement, or one component of it, at all nodes of a part of the mesh (collective).
 
     Args:
-        V: a Lagrange space with ``size`` components, or a part of a mixed one, as ``W.sub(0)``.
+        V: a Lagrange space with ``size`` components, or a part of a mixed space, e.g. ``W.sub(0)``.
         tag: facets, or entities of any dimension: a tag, a list of tags, ``(meshtags, value)``, or facet indices.
         component: 0 is x; None prescribes all components.
-        value: a number, for all components a vector ``(size,)`` as well, or a Constant of one of these shapes, or a Function of ``V``
-            (of a scalar space of the same degree for one component), both of which may be changed between steps. A vector that is a
-            part of a mixed space takes one component after the other.
+        value: a number, or for all components a vector ``(size,)``; or a Constant of one of these shapes, or a Function of ``V``
+            (for one component of a scalar space of the same degree), both of which may be changed between steps. A vector part of a
+            mixed space needs one condition per component.
 
     Returns:
         DOLFINx's Dirichlet condition.
@@ -59,7 +59,7 @@ def dirichlet(
 
 
 def _checked(V: Any, component: int | None, value: Any) -> Any:
-    """The value as ``fem.dirichletbc`` takes it, which fits the space and is finite."""
+    """The value for ``fem.dirichletbc``, checked to be finite and to fit the space."""
     part, degree = compat.is_part(V), compat.lagrange_degree(V)
     size = max(V.num_sub_spaces, 1) if part else V.dofmap.index_map_bs
     if degree is None or not (part or (V.dofmap.bs == size and not len(V.component()))):
@@ -100,11 +100,11 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
 def ds(tag: Part, mesh: Any = None, **metadata: Any) -> ufl.Measure:
     """Measure of the exterior facets of a part of the mesh, as in ``p * v[1] * uem.ds(tags["top"])`` (collective).
 
-    A form may hold any number of them where the package compiles it: in ``UnitedProblem`` and ``integrate``.
+    A form that the package compiles, in ``UnitedProblem`` and ``integrate``, may contain any number of such measures.
 
     Args:
         tag: a tag, a list of tags, ``(meshtags, value)``, or facet indices.
-        mesh: needed where none of these is a tag of ``read_gmsh``, which knows its mesh.
+        mesh: needed unless one of these is a tag of ``read_gmsh``, which contains its mesh.
         metadata: for the form compiler, e.g. ``quadrature_degree=2``.
     """
     mesh = _mesh_of(tag, mesh)
@@ -131,9 +131,9 @@ def interpolate(u: fem.Function, expression: Any) -> None:
     """Interpolate a UFL expression, or a number, into a Function of a Lagrange or DG0 space, ghosts included (collective).
 
     Raises:
-        InputTypeError: if ``u`` is no Function, or the expression none of UFL.
+        InputTypeError: if ``u`` is no Function, or the expression no UFL expression.
         InputError: if the expression has another shape than the values of ``u``.
-        SpaceError: if it is of another mesh, or the values of ``u`` are not known at points.
+        SpaceError: if it is of another mesh, or ``u`` has no nodal values.
     """
     given.kind("u", u, isinstance(u, fem.Function), "a Function", "f = fem.Function(uem.function_space(mesh, 1))")
     remedy = "values of the places x go by u.interpolate(lambda x: ...)"

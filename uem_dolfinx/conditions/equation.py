@@ -1,6 +1,6 @@
-"""Linear equations between displacements of nodes, as users declare them: single ones, families, periodic surfaces.
+"""Declarations of linear equations between displacements of nodes: single equations, families, periodic surfaces.
 
-What they make is ``GivenRows``, which ``united_rows`` turns into uniting equations.
+They return ``GivenRows``, from which ``united_rows`` makes constraint equations.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class GivenRows:
     """Equations ``sum_k c_k . u_k = b`` of this rank, each with its terms.
 
     Attributes:
-        value: number of the value b among those of the declaration ``(m,)``.
+        value: number of the value b among the values of the declaration ``(m,)``.
         row: the equation that each term belongs to ``(k,)``.
-        node: global node of each term ``(k,)``; the first one of an equation tells its place.
+        node: global node of each term ``(k,)``; the first node of an equation is its position in messages.
         coefficients: c of each term ``(k, gdim)``.
     """
 
@@ -45,24 +45,24 @@ class GivenRows:
 
     @staticmethod
     def join(parts: Sequence[GivenRows]) -> GivenRows:
-        """All of several lists, in this order; values keep their numbers."""
+        """The equations of several lists, in this order; numbers of values are unchanged."""
         first = np.cumsum([0, *(len(p) for p in parts)])
         rows = [p.row + f for p, f in zip(parts, first)]
         others = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(GivenRows) if f.name != "row"}
         return GivenRows(row=np.concatenate(rows), **others)
 
     def select(self, which: npt.NDArray[np.bool_]) -> GivenRows:
-        """Some of them, in their order ``(m,)``."""
+        """The equations in a mask ``(m,)``, in the same order."""
         place, terms = np.cumsum(which) - 1, which[self.row]
         return GivenRows(self.value[which], place[self.row[terms]], self.node[terms], self.coefficients[terms])
 
 
 class LinearEquations(Protocol):
-    """What makes linear equations of a displacement.
+    """Declaration of linear equations of a displacement.
 
     Attributes:
-        b: right-hand side, as users may change it between steps.
-        firm: whether it is a mistake that one of them follows from those before it.
+        b: right-hand side, which users may change between steps.
+        firm: whether it is an error if an equation follows from earlier ones.
     """
 
     b: Any
@@ -72,7 +72,7 @@ class LinearEquations(Protocol):
         """The equations (collective)."""
 
     def n_values(self, block: int) -> int:
-        """How many different right-hand sides there are."""
+        """Number of different right-hand sides."""
 
 
 class Equation(given.Sealed):
@@ -81,18 +81,18 @@ class Equation(given.Sealed):
         uem.Equation([(tags["tip"], (0, 1)), ((0.0, 1.0), (0, -2))])                       # u_y of the tip is twice that at (0, 1)
         uem.Equation([(tags["top"], (0, 1)), (tags["corner"], (0, -1))], b=0.0)            # the top stays level
 
-    Equations are handed to ``UnitedProblem(..., equations=[...])``; each eliminates one component of a node, without multipliers.
+    Pass equations to ``UnitedProblem(..., equations=[...])``; each eliminates one component of a node, without multipliers.
 
     Args:
-        terms: pairs of a place and a vector ``c (gdim,)``. Places are tags of points, or of anything with one node, or reference
-            coordinates of a node. One place may have many nodes, as a surface: then there is one equation for each of them but those
-            that are named by other terms.
-        b: a number, a ``fem.Constant`` or a function of the load factor or time. A number or a Constant that ``load`` does not set is
-            approached along with the Dirichlet values.
+        terms: pairs of a place and a vector ``c (gdim,)``. A place is a tag of a point, or of any part with one node, or the reference
+            coordinates of a node. One place may have many nodes, e.g. a surface: then there is one equation for each of its nodes,
+            except nodes of other terms.
+        b: a number, a ``fem.Constant`` or a function of the load factor or time. A number, or a Constant that ``load`` does not set, is
+            ramped with the Dirichlet values.
 
     Raises:
-        InputError, InputTypeError: for terms or values of another form. When the problem is made also a TagError for places that are
-            none, and a ConflictError for equations that leave nothing to eliminate, or follow from or contradict others.
+        InputError, InputTypeError: for terms or values of another form. When the problem is made also a TagError for invalid places,
+            and a ConflictError for equations without a component to eliminate, or that follow from others or contradict them.
     """
 
     firm = True
@@ -107,7 +107,7 @@ class Equation(given.Sealed):
 
     @property
     def places(self) -> list[Any]:
-        """Where the nodes are that it is of."""
+        """The places of its terms."""
         return [where for where, _ in self._terms]
 
     def n_values(self, block: int) -> int:
@@ -138,7 +138,7 @@ class Equation(given.Sealed):
 
 
 class Periodic(given.Sealed):
-    """Nodes of a surface that move as their images do: what ``periodic`` makes."""
+    """Nodes of a surface that move like their images, as returned by ``periodic``."""
 
     firm = False
 
@@ -166,7 +166,7 @@ class Periodic(given.Sealed):
         with agreed(config.comm):
             if turn is not None and len(turn) != config.gdim:
                 raise InputError(f"{role}: turn has the shape {turn.shape}: expected ({config.gdim}, {config.gdim})")
-        # components turn with places where they are those of a vector
+        # components of vectors rotate together with positions
         R = np.eye(g) if turn is None or not config.moves else turn
         follower = nodes_at(config, self._follower, f"the follower of {role}")
         leader = nodes_at(config, self._leader, f"the leader of {role}")
@@ -197,12 +197,12 @@ class Periodic(given.Sealed):
         node = np.broadcast_to(node[:, None], (n, g, 2))
         value = np.broadcast_to(np.arange(g), (n, g))
         if self._turn is None:
-            # without a turn its equations say nothing
+            # without a rotation the equations of such a node are trivial
             c, node, value = c[apart], node[apart], value[apart]
         return _of_terms(value.ravel(), node.reshape(-1, 2), c.reshape(-1, 2, g))
 
     def _images(self, config: Configuration, x: Array, shift: Array, role: str) -> Array:
-        """Where the partners of followers at ``x (n, gdim)`` are (collective)."""
+        """Positions of the partners of followers at ``x (n, gdim)`` (collective)."""
         if self._map is not None:
             images = ask_together(config.comm, f"the map of {role}", self._map, np.array(x))
             with agreed(config.comm):
@@ -231,36 +231,36 @@ def periodic(
     turn: npt.ArrayLike | None = None,
     jump: Value = 0.0,
 ) -> Periodic:
-    """Equations ``u(x) = R u(map(x)) + jump`` for all nodes of a surface, whose mesh matches that of another one.
+    """Equations ``u(x) = R u(map(x)) + jump`` for all nodes of a surface whose mesh matches the mesh of another surface.
 
         uem.periodic(tags["right"], tags["left"], jump=strain @ (L, 0.0))        # a periodic cell under a mean strain
         uem.periodic(tags["cut_2"], tags["cut_1"], turn=R)                        # a sector of a ring, R turns cut_1 into cut_2
 
-    Of periodicity in several directions equations at edges follow from each other; those are left out.
+    With periodicity in several directions, redundant equations at edges are dropped.
 
     Args:
         follower: surface whose nodes are eliminated.
-        leader: surface that they follow, with as many nodes.
-        map: takes places ``(n, gdim)`` of the follower to those of the leader; None shifts them by the distance of the surfaces, or, with
-            a ``turn``, turns them back about the origin.
-        turn: rotation ``R (gdim, gdim)`` of the components; None leaves them.
+        leader: surface that they follow, with the same number of nodes.
+        map: maps positions ``(n, gdim)`` on the follower to positions on the leader. None: a translation by the distance of the
+            surfaces, or, with a ``turn``, the inverse rotation about the origin.
+        turn: rotation ``R (gdim, gdim)`` of the components; None for the identity.
         jump: a vector ``(gdim,)``, one number for a scalar field; numbers, a ``fem.Constant`` or a function of the load factor or time
-            that returns them. Followed as ``b`` of ``Equation``.
+            that returns them. Ramped as ``b`` of ``Equation``.
 
     Returns:
         An entry of ``UnitedProblem(..., equations=[...])``.
 
     Raises:
-        InputError, InputTypeError: as of ``Equation``; SurfaceError, when the problem is made, for surfaces that do not match.
+        InputError, InputTypeError: as in ``Equation``; SurfaceError, when the problem is made, for surfaces that do not match.
     """
     return Periodic(follower, leader, map, turn, jump)
 
 
 def _of_terms(value: Ints, node: Ints, c: Array) -> GivenRows:
-    """Rows of values ``(m,)`` with nodes ``(m, t)`` and vectors ``(m, t, gdim)``; terms at one node are added, vanishing ones left out."""
+    """Rows of values ``(m,)`` with nodes ``(m, t)`` and vectors ``(m, t, gdim)``; terms at the same node are summed."""
     (m, t), g = node.shape, c.shape[-1]
     row = np.repeat(np.arange(m), t)
-    # the first term of each node stands for all of them
+    # all terms of a node are added to its first term
     first = (node[:, :, None] == node[:, None, :]).argmax(axis=2)
     sums = np.zeros((m, t, g))
     np.add.at(sums, (row, first.ravel()), c.reshape(-1, g))
@@ -279,17 +279,17 @@ def _rotation(turn: npt.ArrayLike) -> Array:
 
 
 def checked_value(what: str, value: Any, size: int | None) -> Any:
-    """A right-hand side as it was given, if it can be one: of ``size`` numbers, None for 1, 2 or 3."""
+    """An unchanged right-hand side, after a check: ``size`` numbers, None for 1, 2 or 3."""
     if not callable(value) or isinstance(value, fem.Constant):
         values_of(what, value, size)
     return value
 
 
 def values_of(what: str, value: Any, size: int | None) -> Array:
-    """Numbers of a right-hand side: ``(size,)``; a single 0 stands for a vector of zeros.
+    """Numbers of a right-hand side: ``(size,)``; a single 0 is a vector of zeros.
 
     Raises:
-        InputTypeError, InputError: if they are no finite numbers, or more or less of them.
+        InputTypeError, InputError: if they are not finite, or if their number is wrong.
     """
     words = "a finite number" if size == 1 else f"{size or '2 or 3'} finite numbers, one for each component"
     held = isinstance(value, fem.Constant)

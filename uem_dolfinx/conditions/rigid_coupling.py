@@ -1,4 +1,4 @@
-"""A surface or a body that moves rigidly with a point, or a load at a point that is spread over a surface, as users declare them."""
+"""Declarations of a surface or body that moves rigidly with a point, or of a load at a point that is distributed over a surface."""
 
 from __future__ import annotations
 
@@ -22,38 +22,38 @@ from uem_dolfinx.parallel import agreed, ask_together, reduced
 
 
 class RigidCoupling(given.Sealed):
-    """Nodes of a surface or a body that move with a point as one rigid body, or to which the load of the point is distributed.
+    """Nodes of a surface or body that move with a point as one rigid body, or over which a load at the point is distributed.
 
         uem.RigidCoupling(tags["end"], (10.0, 0.5), force=(0.0, -3.0), moment=12.0)
         uem.RigidCoupling(tags["wheel"], (0.0, 0.0), motion=(0.0, 0.0, None))               # on a bearing, free to turn
         uem.RigidCoupling(tags["pad"], (0.0, 0.0, 2.0), force=(0.0, 0.0, -5.0), distribute=True)
         uem.RigidCoupling(tags["flange"], (3.0, 0.0), mass=2.0, inertia=0.5)                # a motor, in dynamics
 
-    It is handed to ``UnitedProblem(..., couplings=[...])``. The 3 unknowns in the plane and 6 in space are components of nodes of the
-    part; all its other components are eliminated, without multipliers.
+    Pass it to ``UnitedProblem(..., couplings=[...])``. The 3 unknowns in 2D and 6 in 3D are components of nodes of the part; all its
+    other components are eliminated, without multipliers.
 
     Args:
-        where: tag of facets, of cells or of anything with nodes that are not on one line.
-        point: in the drawing ``(gdim,)``; no node need be there.
+        where: tag of facets, of cells or of any entities with nodes that are not on one line.
+        point: reference position ``(gdim,)``; a node there is not needed.
         force: at the point, a vector ``(gdim,)``; numbers, a ``fem.Constant`` or a function of the load factor or time.
-        moment: about the point, a number in the plane, a vector ``(3,)`` in space; likewise.
+        moment: about the point, a number in 2D, a vector ``(3,)`` in 3D; numbers, a ``fem.Constant`` or a function, as ``force``.
         motion: displacement of the point and its rotation, each a number, a ``fem.Constant``, a function of the load factor or time, or
-            None where it is free: ``(u_x, u_y, angle)`` in the plane, ``(u_x, u_y, u_z, r_x, r_y, r_z)`` in space, with r the rotation
-            vector in radians. Numbers are approached along with the Dirichlet values. None leaves all free.
+            None if free: ``(u_x, u_y, angle)`` in 2D, ``(u_x, u_y, u_z, r_x, r_y, r_z)`` in 3D, with r the rotation vector in radians.
+            Numbers are ramped with the Dirichlet values. None leaves all components free.
         mass: of a rigid body that is fixed to the part and has its centre at the point, in addition to the mass of the meshed part.
-            It counts in dynamics and its gravity, and in ``modes``; statics does without it.
-        inertia: of that body about the point: a number in the plane, a number for all axes or a symmetric matrix ``(3, 3)`` in space, in
-            the axes of the drawing; it turns with the part.
-        distribute: the force and the moment are shared by the nodes and nothing is stiffened; the point has their mean motion.
-        rotations: ``"large"``, ``"small"``, or None for small ones where the residual is linear in the displacement.
+            It counts in dynamics, with gravity, and in ``modes``; statics ignores it.
+        inertia: of that body about the point: a number in 2D, a number for all axes or a symmetric matrix ``(3, 3)`` in 3D, in the
+            axes of the reference configuration; it rotates with the part.
+        distribute: distribute force and moment over the nodes without stiffening the part; the point has the mean motion of the nodes.
+        rotations: ``"large"``, ``"small"``, or None for small rotations if the residual is linear in the displacement.
 
     Attributes:
-        name: that of the part.
+        name: name of the part.
         point: as given ``(gdim,)``.
 
     Raises:
         InputError, InputTypeError: for values of another form, an impossible inertia, or a motion or a mass with
-            ``distribute=True``. When the problem is made also a TagError for parts that are none, and a SurfaceError for nodes on
+            ``distribute=True``. When the problem is made also a TagError for invalid parts, and a SurfaceError for nodes on
             one line.
     """
 
@@ -92,18 +92,18 @@ class RigidCoupling(given.Sealed):
                 "distribute out, or prescribe displacements"
             )
         self.mass = given.number("mass", mass, given.NOT_NEGATIVE)
-        #: About the point, in the drawing ``(n_turns, n_turns)``.
+        #: About the point, in the reference configuration ``(n_turns, n_turns)``.
         self.inertia = checked_inertia(inertia, self._sizes[1])
         if self.distribute and (self.mass or self.inertia.any()):
             raise InputError(
                 "mass or inertia of a RigidCoupling with distribute=True: only a part that moves rigidly carries them; leave distribute "
                 "out, or give the part more density"
             )
-        #: The ``dynamics.added_mass.AddedMass`` that they are in a problem; None without any.
+        #: The ``dynamics.added_mass.AddedMass`` of mass and inertia in a problem, or None.
         self.added: Any = None
-        #: Rotation that was known last, which tells the number of turns ``(n_turns,)``.
+        #: Last known rotation, which determines the number of full turns ``(n_turns,)``.
         self.turns: Array = np.zeros(self._sizes[1])
-        #: Force and moment that the prescribed motion needs, as read last.
+        #: Force and moment of the prescribed motion, as last computed.
         self.reactions: tuple[Array, Array] = np.zeros(self._sizes[0]), np.zeros(self._sizes[1])
         self._set: RigidSet | None = None
         self._asked: dict[Any, Any] = {}
@@ -111,7 +111,7 @@ class RigidCoupling(given.Sealed):
     # -- in a problem ------------------------------------------------------------------------------------------------------
 
     def attach(self, config: Configuration, finite: bool) -> RigidSet:
-        """Take the nodes of a problem, whose residual may be nonlinear (``finite``) (collective)."""
+        """Find the nodes in a problem, whose residual is nonlinear if ``finite`` (collective)."""
         if self._set is not None:
             raise SpaceError(f"the RigidCoupling of '{self.name}' belongs to another problem: make a new one for every problem")
         with agreed(config.comm):
@@ -133,7 +133,7 @@ class RigidCoupling(given.Sealed):
 
     @property
     def nodes(self) -> RigidSet:
-        """The nodes of the problem it belongs to; a SpaceError if it belongs to none."""
+        """The nodes in its problem; SpaceError if it belongs to no problem."""
         if self._set is None:
             raise SpaceError(
                 f"the RigidCoupling of '{self.name}' is in no problem yet: hand it to UnitedProblem(..., couplings=[...])"
@@ -141,7 +141,7 @@ class RigidCoupling(given.Sealed):
         return self._set
 
     def take_load(self, at: float) -> None:
-        """Ask functions for the values of a load factor or time; a UserFunctionError if one raises (collective)."""
+        """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
         comm = self.nodes.config.comm
         for key, value in (("force", self._loads[0]), ("moment", self._loads[1]), *self.prescribed.items()):
             if callable(value) and not isinstance(value, fem.Constant):
@@ -151,7 +151,7 @@ class RigidCoupling(given.Sealed):
                 self._asked[key] = ask_together(comm, what, value, at)
 
     def given_values(self) -> dict[str, Any]:
-        """Its values as they are now, by name; functions are those that they were asked for last."""
+        """Its present values by name; functions are replaced by their last values."""
         loads: dict[Any, Any] = {"force": self._loads[0], "moment": self._loads[1], **self.prescribed}
         now = {key if isinstance(key, str) else f"motion[{key}]": self._asked.get(key, v) for key, v in loads.items()}
         return {"the point": self.point, "the mass": self.mass, "the inertia": self.inertia} | {
@@ -159,7 +159,7 @@ class RigidCoupling(given.Sealed):
         }
 
     def loads(self) -> tuple[Array, Array]:
-        """Force ``(gdim,)`` and moment ``(n_turns,)`` at the point as they are now (collective)."""
+        """Present force ``(gdim,)`` and moment ``(n_turns,)`` at the point (collective)."""
         with agreed(self.nodes.config.comm):
             force, moment = (
                 values_of(f"the {key} of the RigidCoupling of '{self.name}'", self._asked.get(key, value), size)
@@ -168,12 +168,12 @@ class RigidCoupling(given.Sealed):
         return force, moment
 
     def nodal_forces(self) -> Array:
-        """What these are at the owned nodes of the part ``(n, gdim)`` (collective)."""
+        """Nodal forces of ``loads`` at the owned nodes of the part ``(n, gdim)`` (collective)."""
         config = self.nodes.config
         return self.nodes.spread(config.displacement[: config.n_owned], *self.loads())
 
     def wanted(self) -> Array:
-        """Values of the prescribed components as they are now ``(k,)``, in their order (collective)."""
+        """Present values of the prescribed components ``(k,)``, in the order of ``prescribed`` (collective)."""
         with agreed(self.nodes.config.comm):
             found = [
                 values_of(f"motion[{i}] of the RigidCoupling of '{self.name}'", self._asked.get(i, v), 1)[0]
@@ -182,7 +182,7 @@ class RigidCoupling(given.Sealed):
         return np.array(found, dtype=float)
 
     def ramped(self, loaded: Sequence[fem.Constant]) -> npt.NDArray[np.bool_]:
-        """Which prescribed components are approached along with the Dirichlet values ``(k,)``; ``loaded`` Constants are not."""
+        """Mask of prescribed components that are ramped with the Dirichlet values ``(k,)``; ``loaded`` Constants are not."""
         return np.array(
             [
                 not any(v is c for c in loaded) if isinstance(v, fem.Constant) else not callable(v)
@@ -192,9 +192,9 @@ class RigidCoupling(given.Sealed):
         )
 
     def motion_of(self, u: Array, near: Array | None = None) -> Array:
-        """Displacement of the point and rotation that a displacement ``(n_owned, gdim)`` makes ``(gdim + n_turns,)`` (collective).
+        """Displacement of the point and rotation ``(gdim + n_turns,)``, from a displacement ``(n_owned, gdim)`` (collective).
 
-        ``near (n_turns,)`` is a rotation that tells the number of turns, None for the one that was known last.
+        ``near (n_turns,)`` is a rotation that determines the number of full turns; None for the last known rotation.
         """
         at = self.nodes.placement(u)
         shift = at.displacement(self.point[None])[0]
@@ -205,7 +205,7 @@ class RigidCoupling(given.Sealed):
         if not self.distribute:
             rigid[nodes_at(config, self.where, f"the part of the RigidCoupling of '{self.name}'")] = True
 
-    # -- what users read ---------------------------------------------------------------------------------------------------
+    # -- results -----------------------------------------------------------------------------------------------------------
 
     @property
     def _motion(self) -> Array:
@@ -219,19 +219,19 @@ class RigidCoupling(given.Sealed):
 
     @property
     def rotation(self) -> Any:
-        """Angle in the plane, rotation vector ``(3,)`` in space, in radians; several turns are counted (collective)."""
+        """Angle in 2D, rotation vector ``(3,)`` in 3D, in radians, including full turns (collective)."""
         turn = self._motion[self._sizes[0] :]
         return float(turn[0]) if len(turn) == 1 else turn
 
     @property
     def reaction(self) -> tuple[Array, Any]:
-        """Force ``(gdim,)`` and moment about the point with which the prescribed motion acts on the part; zero where it is free."""
-        # in no problem there is none
+        """Force ``(gdim,)`` and moment about the point of the prescribed motion on the part; zero for free components."""
+        # raises without a problem
         _, (force, moment) = self.nodes, self.reactions
         return force, float(moment[0]) if len(moment) == 1 else moment
 
     def read_reactions(self, forces: Array) -> None:
-        """Take the forces of the coupling at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        """Compute the reactions from the forces of the coupling at the owned nodes ``(n_owned, gdim)`` (collective)."""
         config, own = self.nodes.config, forces[self.nodes.nodes]
         at = self.nodes.placement(config.displacement[: config.n_owned])
         if self.nodes.large:
@@ -248,7 +248,7 @@ def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:
     """Inertia as a matrix ``(n_turns, n_turns)``.
 
     Raises:
-        InputError, InputTypeError: if there is no body with it, whose principal moments are none of them more than the sum of the others.
+        InputError, InputTypeError: if no body can have it: principal moments must not be negative, nor exceed the sum of the others.
     """
     if np.ndim(value) == 0:
         return np.eye(n_turns) * given.number("inertia", value, given.NOT_NEGATIVE)
@@ -277,7 +277,7 @@ def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:
 
 
 def nearest_turn(turn: Array, known: Array) -> Array:
-    """The rotation by ``turn (n_turns,)`` and whole turns that is nearest to a known one."""
+    """The rotation by ``turn (n_turns,)`` plus full turns that is nearest to a known rotation."""
     angle = float(np.linalg.norm(turn)) if len(turn) == 3 else float(turn[0])
     if len(turn) == 1:
         return turn + 2.0 * np.pi * np.round((known[0] - angle) / (2.0 * np.pi))

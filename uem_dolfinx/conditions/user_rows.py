@@ -1,4 +1,4 @@
-"""All equations of users together: linear ones, and rigid couplings, whose rows follow the bodies."""
+"""All equations of users together: linear equations, and rigid couplings, whose rows depend on the displacement."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from uem_dolfinx.parallel import agree
 
 
 class UserRows(Protocol):
-    """What a problem asks of equations of users.
+    """Interface of users' equations to a problem.
 
     Attributes:
-        equations: of this rank, as last taken.
-        multipliers: forces along what they eliminate ``(m,)``, as last taken.
-        turns: what a checkpoint keeps of them.
+        equations: of this rank, as last computed.
+        multipliers: forces along their eliminated components ``(m,)``, as last set.
+        turns: their data in a checkpoint.
     """
 
     equations: UnitingEquations
@@ -32,19 +32,19 @@ class UserRows(Protocol):
 
     @property
     def turning(self) -> bool:
-        """Whether they depend on where the bodies are."""
+        """Whether they depend on the displacement."""
 
     def take_load(self, at: float) -> None:
-        """Ask functions for the values of a load factor or time (collective)."""
+        """Evaluate functions at a load factor or time (collective)."""
 
     def given_values(self) -> dict[str, Any]:
-        """Right-hand sides of linear equations as they are now, by name."""
+        """Present right-hand sides of linear equations, by name."""
 
     def begin_step(self, start: Array, fraction: float) -> None:
-        """Begin a step whose ramp began at a displacement ``(n_owned, gdim)`` and goes so far (collective)."""
+        """Begin a step at a fraction of a ramp that started at a displacement ``(n_owned, gdim)`` (collective)."""
 
     def place(self) -> None:
-        """Put nodes where equations that are not linear take them (collective)."""
+        """Move nodes to positions that satisfy nonlinear equations (collective)."""
 
     def at_present(self) -> UnitingEquations:
         """The equations at the present displacement, with its gaps (collective)."""
@@ -53,47 +53,47 @@ class UserRows(Protocol):
         """Largest gap, a length, on this rank."""
 
     def curvature(self) -> list[tuple[Ints, Array]]:
-        """What they add to the tangent, as a ``Contact`` does: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
+        """Geometric stiffness in the tangent: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
 
     def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
-        """Likewise what masses at points add, times a factor, by default that of the step in time (collective)."""
+        """Masses at points times a factor, by default of the time step, in the format of ``curvature`` (collective)."""
 
     def settle(self, dynamics: Any) -> None:
-        """Give nodes the velocities and accelerations that equations that are not linear leave them (collective)."""
+        """Set velocities and accelerations of nodes that are consistent with nonlinear equations (collective)."""
 
     def check(self) -> None:
         """End a step: refuse values that contradict each other, or Dirichlet values (collective)."""
 
     @property
     def rigid(self) -> RigidNodes | None:
-        """Rigid couplings, whose rows come last; None without any."""
+        """Rigid couplings, whose rows come last, or None."""
 
     def forces(self, multipliers: Array) -> Array:
-        """Forces with which the equations act on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        """Forces of the equations on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
 
 
 class RigidNodes(Protocol):
-    """What rigid couplings ask of other equations: to speak of the components that are left.
+    """Interface of rigid couplings to other equations, which must not contain eliminated components.
 
-    An equation at a node that is eliminated already would have to eliminate something else of a whole body.
+    An equation at a node that is eliminated already would have to eliminate another component of the whole rigid body.
     """
 
     @property
     def n_rows(self) -> int:
-        """How many rows there are on this rank."""
+        """Number of rows on this rank."""
 
     def left(self, free: Bools) -> Bools:
         """Free components ``(n_rows, gdim)`` without those that the couplings eliminate."""
 
     def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
-        """Equations with what they say of eliminated components said by those that these follow (collective)."""
+        """Equations with eliminated components replaced by the components that these follow (collective)."""
 
     def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
-        """Multipliers of the couplings' equations ``(k,)`` beside others as they were before they were rewritten (collective).
+        """Multipliers of the couplings' equations ``(k,)`` together with other equations in their original form (collective).
 
         Args:
-            multipliers: beside the rewritten ones ``(k,)``.
-            equations: the others, as given.
+            multipliers: together with the rewritten equations ``(k,)``.
+            equations: the other equations in their original form.
             lam: their multipliers ``(m,)``.
         """
 
@@ -103,9 +103,9 @@ class JoinedRows:
 
     Args:
         config: configuration of the displacement.
-        linear: linear equations; None for none.
-        rigid: of each coupling that makes nodes rigid.
-        couplings: all of them.
+        linear: linear equations, or None.
+        rigid: rows of each coupling that makes nodes rigid.
+        couplings: all couplings.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class JoinedRows:
 
     def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
         """As of ``RigidNodes``."""
-        # what was rewritten acts on the eliminated components themselves
+        # original equations act on the eliminated components directly
         forces = forces_of(self._config, equations, np.where(equations.active, lam, 0.0))
         parts = [np.where(one.eliminated, forces[one.set.nodes], 0.0).ravel() for one in self.each]
         return np.asarray(multipliers - np.concatenate(parts))
@@ -235,7 +235,7 @@ class JoinedRows:
 
 
 def _refuse_shared(coupling: RigidCoupling, taken: Bools) -> None:
-    """Mark its nodes as taken ``(n_owned,)``; a ConflictError if another coupling has one (collective)."""
+    """Mark a coupling's nodes as taken ``(n_owned,)``; ConflictError if another coupling has one of them (collective)."""
     nodes, config = coupling.nodes.nodes, coupling.nodes.config
     twice, error = nodes[taken[nodes]], None
     if len(twice):
@@ -256,16 +256,16 @@ def rows_of_users(
     load: Any,
     at: float,
 ) -> UserRows | None:
-    """Equations of users among contactors ``(n,)`` of several contacts, None without any (collective).
+    """Equations of users in a problem with contactors ``(n,)`` of several contacts, or None (collective).
 
     Args:
         config: configuration of the displacement.
-        equations: linear ones.
+        equations: linear equations.
         couplings: attached.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
         contactors: owned nodes of each contact.
         load: of the problem.
-        at: load factor or time at which functions are asked for their values first.
+        at: load factor or time of the first evaluation of functions.
     """
     if not couplings:
         return unite(config, equations, free, contactors, load, at) if equations else None

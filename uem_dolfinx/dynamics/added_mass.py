@@ -1,12 +1,12 @@
 """Mass and inertia that rigid couplings add at their points.
 
-They are carried by the point p and by axes d_i of length one that turn with the body: with the principal values of the inertia about p,
-``J_i = tr(I) / 2 - I_i``, the kinetic energy is, for every rotation,
+They are represented by the point p and by unit axes d_i that rotate with the body: with the principal values I_i of the inertia about p,
+and ``J_i = tr(I) / 2 - I_i``, the kinetic energy is, for every rotation,
 
     (m |p'|^2 + sum J_i |d_i'|^2) / 2
 
-In the plane one axis does, with J the inertia. The rule of integration acts on p and d_i as on the displacements of nodes, which have
-gyroscopic terms thereby; what it makes of them are a force at the point and a moment about it.
+In 2D one axis is sufficient, with J the inertia. The integrator acts on p and d_i in the same way as on displacements of nodes, which
+includes gyroscopic terms. The inertia forces are then a force at the point and a moment about it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from uem_dolfinx.parallel import gathered
 
 
 class AddedMass:
-    """What one coupling adds, alike on all ranks (collective).
+    """Mass and inertia of one coupling, the same on all ranks (collective).
 
     Args:
         coupling: attached.
@@ -33,8 +33,8 @@ class AddedMass:
         set: nodes of the coupling.
         masses: of the point, and of its axes J ``(1 + n_axes,)``.
         places: displacement of the point, and change of its axes, of the committed state ``(1 + n_axes, gdim)``.
-        velocity, acceleration, forces: theirs, and the forces of inertia ``(1 + n_axes, gdim)``.
-        carried: inertia minus weight with which the coupling was in equilibrium last ``(1 + n_axes, gdim)``.
+        velocity, acceleration, forces: of point and axes, and their inertia forces ``(1 + n_axes, gdim)``.
+        carried: inertia forces minus weight in the last equilibrium ``(1 + n_axes, gdim)``.
         factor: of the masses in the tangent.
     """
 
@@ -47,7 +47,7 @@ class AddedMass:
         self.velocity, self.acceleration, self.forces, self.carried = (np.zeros_like(self.places) for _ in range(4))
         self.factor = 0.0
         self._weight = np.zeros_like(self.places)
-        #: Scheme of the step that has begun, and what it says of it; None between steps.
+        #: Scheme of the present step, and its coefficients; None between steps.
         self._step: tuple[Scheme, float, Array, float, Array] | None = None
 
     # -- as a rigid body ---------------------------------------------------------------------------------------------------
@@ -58,7 +58,7 @@ class AddedMass:
         return self.set.placement(config.displacement[: config.n_owned])
 
     def _now(self) -> Array:
-        """Where point and axes are beside the drawing (collective)."""
+        """Present displacement of the point and change of the axes (collective)."""
         at = self._placement
         if at.small is None:
             change = self._axes @ (at.motion.Q - np.eye(len(self._point))).T
@@ -67,35 +67,35 @@ class AddedMass:
         return np.concatenate([at.displacement(self._point[None]), change])
 
     def arms(self, at: Placement) -> Array:
-        """Arms of their forces about the point ``(1 + n_axes, gdim)``."""
+        """Arms of the forces of point and axes about the point ``(1 + n_axes, gdim)``."""
         return np.concatenate([np.zeros((1, len(self._point))), self._axes @ at.motion.Q.T])
 
     def motions(self, at: Placement) -> Array:
-        """Their velocities in shifts and unit turns about the middle of the set ``(1 + n_axes, gdim, gdim + n_turns)``."""
+        """Velocities in translations and unit rotations about the middle of the set ``(1 + n_axes, gdim, gdim + n_turns)``."""
         V = velocities(self.arms(at))
         V[0], V[1:, :, : len(self._point)] = velocities(at.arms(self._point[None]))[0], 0.0
         return V
 
     def bend(self, at: Placement, turn: Array) -> Array:
-        """Accelerations ``(1 + n_axes, gdim)`` that a spin ``(n_turns,)`` makes about the middle of the set."""
+        """Centripetal accelerations ``(1 + n_axes, gdim)`` of an angular velocity ``(n_turns,)`` about the middle of the set."""
         arms = self.arms(at)
         arms[0] = at.arms(self._point[None])[0]
         return turned(turn, turned(turn, arms))
 
     def mass_of(self, at: Placement) -> Array:
-        """Mass that the motions of the set feel ``(gdim + n_turns, gdim + n_turns)``."""
+        """Mass matrix of the motions of the set ``(gdim + n_turns, gdim + n_turns)``."""
         V = self.motions(at)
         return np.asarray(np.einsum("n,ngz,ngy->zy", self.masses, V, V))
 
     def momentum_of(self, at: Placement, rates: Array) -> Array:
-        """What these masses with rates ``(1 + n_axes, gdim)`` have along the motions of the set ``(gdim + n_turns,)``."""
+        """Momentum of these masses along the motions of the set ``(gdim + n_turns,)``, from rates ``(1 + n_axes, gdim)``."""
         return np.asarray(np.einsum("n,ngz,ng->z", self.masses, self.motions(at), rates))
 
     @property
     def inert(self) -> Indices:
-        """Owned nodes whose rigid motions it gives inertia (collective).
+        """Owned nodes whose rigid motions have inertia by this mass (collective).
 
-        All of them, or of a mass alone the one next to the point, or none of an inertia alone on what may shift.
+        All nodes with enough inertia; only the node nearest to the point for a mass alone; no node for an inertia alone without bearing.
         """
         s, n_axes = self.set, np.count_nonzero(self.masses[1:])
         if n_axes >= len(self._point) - 1 and (self.masses[0] > 0.0 or self._on_bearing):
@@ -114,31 +114,31 @@ class AddedMass:
     # -- forces ------------------------------------------------------------------------------------------------------------
 
     def loads(self) -> Array:
-        """Inertia minus weight where the set is now ``(1 + n_axes, gdim)`` (collective)."""
+        """Inertia forces minus weight at the present displacement ``(1 + n_axes, gdim)`` (collective)."""
         return (self.forces if self._step is None else self._inertia()) - self._weight
 
     def nodal_forces(self, loads: Array) -> Array:
-        """What such loads are at the owned nodes of the set ``(n, gdim)`` (collective)."""
+        """Nodal forces of such loads at the owned nodes of the set ``(n, gdim)`` (collective)."""
         config = self.set.config
         turning = np.atleast_1d(moments(self.arms(self._placement), loads).sum(axis=0))
         return self.set.spread(config.displacement[: config.n_owned], loads[0], turning)
 
     @property
     def _as_forces(self) -> Array:
-        """Factors that make forces of what turns the axes, alike to those at the nodes of the set ``(1 + n_axes, 1)``."""
+        """Factors that convert moments on the axes to forces at the nodes of the set ``(1 + n_axes, 1)``."""
         return np.append(1.0, np.full(len(self._axes), 1.0 / self.set.radius))[:, None]
 
     def size(self) -> float:
-        """Norm of the loads, which the nodes of a body in balance do not see (collective)."""
+        """Norm of the loads, which may cancel at the nodes of a body (collective)."""
         return float(np.linalg.norm(self._as_forces * self.loads()))
 
     def rounding(self) -> float:
-        """Norm of what the displacement times the tangent is, whose rounding is in the loads (collective)."""
+        """Norm of tangent times displacement, for the rounding of the loads (collective)."""
         ways = np.append(np.linalg.norm(self._now()[0]), np.ones(len(self._axes)))[:, None]
         return self.factor * float(np.linalg.norm(self._as_forces * self.masses[:, None] * ways))
 
     def _inertia(self) -> Array:
-        """As of ``Dynamics`` (collective)."""
+        """Inertia forces, as in ``Dynamics`` (collective)."""
         assert self._step is not None
         scheme, a_rate, a_past, _, _ = self._step
         a = a_rate * (self._now() - self.places) + a_past
@@ -148,12 +148,12 @@ class AddedMass:
     # -- in time -----------------------------------------------------------------------------------------------------------
 
     def start(self, velocity: Array, gravity: Array) -> None:
-        """Move with the nodes at the start, whose velocities these are ``(n_owned, gdim)``, and fall ``(gdim,)`` (collective)."""
+        """Set the initial velocity from the nodes' velocities ``(n_owned, gdim)``, and gravity ``(gdim,)`` (collective)."""
         self.velocity = self._carried(velocity)
         self._weight[0] = self.masses[0] * gravity
 
     def _carried(self, rates: Array) -> Array:
-        """Rates that those of the nodes ``(n_owned, gdim)`` give point and axes ``(1 + n_axes, gdim)`` (collective)."""
+        """Rates of point and axes ``(1 + n_axes, gdim)``, from rates of the nodes ``(n_owned, gdim)`` (collective)."""
         at = self._placement
         return self.motions(at) @ self.set.motion_of(at, rates)
 
@@ -167,12 +167,12 @@ class AddedMass:
         self._step = None
 
     def accelerate(self, acceleration: Array) -> None:
-        """Take the first acceleration, of the nodes ``(n_owned, gdim)`` (collective)."""
+        """Set the first acceleration from the acceleration of the nodes ``(n_owned, gdim)`` (collective)."""
         self.acceleration = self._carried(acceleration)
         self.forces = self.masses[:, None] * self.acceleration
 
     def commit(self) -> None:
-        """Keep what belongs to the present displacement (collective)."""
+        """Commit the rates and forces of the present displacement (collective)."""
         now, self.carried = self._now(), self.loads()
         if self._step is not None:
             du, (_, a_rate, a_past, v_rate, v_past) = now - self.places, self._step
@@ -181,7 +181,7 @@ class AddedMass:
         self.places = now
 
     def change_rates(self, velocity: Array, acceleration: Array) -> None:
-        """Go on with another velocity and acceleration of the committed state ``(1 + n_axes, gdim)``."""
+        """Replace velocity and acceleration of the committed state ``(1 + n_axes, gdim)``."""
         self.forces = self.forces + self.masses[:, None] * (acceleration - self.acceleration)
         self.velocity, self.acceleration = velocity, acceleration
 

@@ -1,6 +1,6 @@
-"""Inertia: velocities, accelerations and the forces they make, by Newmark's rule or the generalised-alpha method.
+"""Inertia: velocities, accelerations and inertia forces, by Newmark's method or the generalised-alpha method.
 
-They turn a static residual into a dynamic one: the solver adds these forces to the residual and a multiple of M to K.
+The solver adds these forces to the static residual, and a multiple of M to K.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ class Dynamics(given.Sealed):
         time: of the committed state.
         start: time at the start.
         accelerated: whether the acceleration is consistent with the forces.
-        moving: whether a step has begun that is neither kept nor left.
+        moving: whether a step has begun that is neither committed nor restored.
         massy: components that have mass, of the owned nodes ``(n_owned, gdim)``.
         held: owned components that are prescribed ``(n,)``.
         past: velocity in the damping form minus its part from the displacement, a Function; only with damping.
-        resumed: how often a checkpoint has been read into them.
-        dt: length of the step that has begun last.
+        resumed: number of checkpoints that have been read.
+        dt: length of the last step that was begun.
     """
 
     past: fem.Function
@@ -108,11 +108,11 @@ class Dynamics(given.Sealed):
         self.damping_form: ufl.Form | None = None
 
     def attach(self, config: Configuration) -> ufl.Form | None:
-        """Take in the problem's displacement, refuse what does not fit it, and return the damping form (collective)."""
+        """Attach to the problem's displacement, check that all arguments fit it, and return the damping form (collective)."""
         if self._attached:
             raise SpaceError("these dynamics belong to another problem: make new ones for every problem")
         self._attached, self.config, g = True, config, config.gdim
-        #: The mass and what it is among other fields.
+        #: The mass, and its matrix in the rows of the constrained system.
         self._in_rows: tuple[PETSc.Mat, PETSc.Mat] | None = None
         self._n, error = g * config.n_owned, None
         wanted = self._n, g * config.index_map.size_global
@@ -126,7 +126,7 @@ class Dynamics(given.Sealed):
                 "the mass is of another mesh than the displacement, or numbered otherwise, as a collapsed part of a mixed space: make it "
                 "with the function space of the displacement, or uem.function_space(mesh, degree, (gdim,))"
             )
-        # on other ranks the parts may be equally large by chance
+        # on other ranks the sizes may agree by chance
         agree(config.comm, error)
         self.velocity = fem.Function(config.V, name="velocity")
         self.acceleration = fem.Function(config.V, name="acceleration")
@@ -175,25 +175,25 @@ class Dynamics(given.Sealed):
 
     @property
     def _displacement(self) -> Array:
-        """Of the local nodes ``(n_local * gdim,)``."""
+        """Displacement of the local nodes ``(n_local * gdim,)``."""
         return self.config.displacement.ravel()
 
     @property
     def matrix(self) -> PETSc.Mat:
-        """M, with the rows and columns of the united system (first time: collective)."""
+        """M, with the rows and columns of the constrained system (first time: collective)."""
         if self._in_rows is None or self._in_rows[0] is not self.mass.M:
             self._in_rows = self.mass.M, self.config.in_rows(self.mass.M)
         return self._in_rows[1]
 
     def hold(self, held: Bools) -> None:
-        """Take which owned components are prescribed ``(n_owned, gdim)``: their velocities are those of what is prescribed."""
+        """Set the mask of prescribed owned components ``(n_owned, gdim)``, whose velocities follow the prescribed motion."""
         self.held = held.ravel()
 
     def make_contactors_massless(self, contacts: Sequence[Contact]) -> None:
-        """Hand the mass of contact surfaces on as ``massless.without_surfaces`` does, or warn that contactors keep it (collective).
+        """Redistribute the mass of contact surfaces by ``massless.without_surfaces``, or warn that contactors have mass (collective).
 
         Raises:
-            MassError: if a body cannot do without the mass of its contactors.
+            MassError: if the other nodes of a body cannot take the mass of its contactors.
         """
         from uem_dolfinx.dynamics.massless import contactor_nodes, without_surfaces
 
@@ -211,20 +211,20 @@ class Dynamics(given.Sealed):
         self._weight = self.mass.M * self._like(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
 
     def add(self, one: AddedMass) -> None:
-        """Let a mass at a point move along with the nodes of its coupling (collective)."""
+        """Add a mass at a point that moves with the nodes of its coupling (collective)."""
         one.start(self._of_nodes(self.velocity), self._down)
         self.added.append(one)
 
     @property
     def inert(self) -> Bools:
-        """Components whose rigid motions have inertia: those with mass, and those of nodes that carry added ones (collective)."""
+        """Mask of components with inertia in rigid motions: components with mass, and nodes with added masses (collective)."""
         found = self.massy.copy()
         for one in self.added:
             found[one.inert] = True
         return found
 
     def _of_nodes(self, field: fem.Function) -> Array:
-        """Its values at the owned nodes ``(n_owned, gdim)``."""
+        """Values of a field at the owned nodes ``(n_owned, gdim)``."""
         return np.asarray(field.x.array[: self._n].reshape(-1, self.config.gdim))
 
     def _like(self, values: Array) -> PETSc.Vec:
@@ -245,12 +245,12 @@ class Dynamics(given.Sealed):
             one.begin(self.scheme, dt)
 
     def _prescribed(self) -> tuple[Array, Array, Array]:
-        """Velocity at the end, mean acceleration, and that in the equation of motion, of prescribed components, from what is prescribed.
+        """Final velocity, mean acceleration, and acceleration in the equation of motion, of prescribed components.
 
-        Neither rule takes them from displacements without an echo of every jump for ever: v(n+1) = 2 du/dt - v(n). With w the mean
-        velocity of the step, v(n+1) = w + dt/2 times the smaller of two slopes, that of w and that of v in the step before, and 0 where
-        their signs differ. That is of second order where the motion is smooth, and w at once behind a jump, which so is an impact
-        within the step. Accelerations are differences of v, carried on to the instant of the equation.
+        Both integrators would repeat every jump of a prescribed velocity for ever: v(n+1) = 2 du/dt - v(n). So, with w the mean velocity
+        of the step, v(n+1) = w + dt/2 times the smaller of two slopes, the slope of w and the slope of v in the previous step, and 0 if
+        their signs differ. This is of second order for smooth motions, and equal to w after a jump, which is then an impact within the
+        step. Accelerations are differences of v, extrapolated to the time of the equation of motion.
         """
         i, dt, last = self.held, self.dt, self._last
         v, before = self._velocity[: self._n][i], self._acceleration[: self._n][i]
@@ -263,7 +263,7 @@ class Dynamics(given.Sealed):
         return end, mean, mean + on * (mean - before)
 
     def update_rates(self) -> None:
-        """Bring the velocity of prescribed components in the damping form up to the present displacement (collective)."""
+        """Update the velocity of prescribed components in the damping form to the present displacement (collective)."""
         if self.damping is None or not self.moving:
             return
         i = np.flatnonzero(self.held)
@@ -295,7 +295,7 @@ class Dynamics(given.Sealed):
 
     @contextmanager
     def without_inertia(self) -> Iterator[None]:
-        """For a while, a tangent without mass and damping."""
+        """A block in which the tangent has no mass and damping."""
         rate = None if self.damping is None else float(self._rate.value)
         factor, self.factor = self.factor, 0.0
         if rate is not None:
@@ -309,7 +309,7 @@ class Dynamics(given.Sealed):
 
     @timed("inertia forces")
     def load(self) -> PETSc.Vec:
-        """Inertia forces minus weight at the present displacement, what the residual lacks (collective)."""
+        """Inertia forces minus weight at the present displacement, to be added to the residual (collective)."""
         load = self._inertia() if self.moving else self._like(self.forces.x.array[: self._n])
         load.axpy(-1.0, self._weight)
         if self.added:
@@ -317,7 +317,7 @@ class Dynamics(given.Sealed):
         return load
 
     def added_forces(self, carried: bool = False) -> Array:
-        """Inertia minus weight of masses at points as nodes share them, or what couplings carried last ``(n,)`` (collective)."""
+        """Nodal inertia forces minus weight of masses at points, present or as last committed (``carried``) ``(n,)`` (collective)."""
         forces = np.zeros((self.config.n_owned, self.config.gdim))
         for one in self.added:
             forces[one.set.nodes] += one.nodal_forces(one.carried if carried else one.loads())
@@ -336,10 +336,10 @@ class Dynamics(given.Sealed):
         return inertia
 
     def accelerate(self, restriction: Restriction, F: PETSc.Vec, added: PETSc.Mat | None = None) -> None:
-        """Acceleration at the start, of bodies united by P under F, the static residual minus weight: ``P'MP a = -P'F`` (collective).
+        """Initial acceleration with constraints P under F, the static residual minus weight: ``P'MP a = -P'F`` (collective).
 
-        ``added`` is what masses at points add to M. A NotFiniteError refuses forces that are not finite, a LinearSolveError negative
-        masses.
+        ``added`` contains the masses at points, in addition to M. NotFiniteError for forces that are not finite, LinearSolveError for
+        negative masses.
         """
         if not np.isfinite(F.norm()):
             raise NotFiniteError(
@@ -358,17 +358,17 @@ class Dynamics(given.Sealed):
         self.accelerated = True
 
     def rates(self) -> tuple[Array, Array]:
-        """Velocity and acceleration at the end of the step under way, at the present displacement, ``(n,)`` each."""
+        """Velocity and acceleration at the end of the present step, at the present displacement, ``(n,)`` each."""
         n, held, massy = self._n, self.held, self.massy.ravel()
         end, mean, _ = self._prescribed()
         du = (self._displacement - self._u)[:n]
         a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
         a[held], v[held] = mean, end
-        # what has no mass has no velocity of its own
+        # components without mass have the mean velocity of the step
         return np.where(massy, v, du / self.dt), np.where(massy, a, 0.0)
 
     def commit(self) -> None:
-        """Keep velocity and acceleration that belong to the present displacement."""
+        """Commit velocity and acceleration at the present displacement."""
         if self.moving:
             n, dt, held = self._n, self.dt, self.held
             self.forces.x.array[:n] = self._inertia().array_r
@@ -385,7 +385,7 @@ class Dynamics(given.Sealed):
         self._copy_committed()
 
     def change_rates(self, velocity: Array, acceleration: Array) -> None:
-        """Give free components of the committed state another velocity and acceleration, with the same momentum ``(n,)`` (collective)."""
+        """Replace velocity and acceleration of free components of the committed state, at the same momentum ``(n,)`` (collective)."""
         n, free = self._n, ~self.held
         change = np.where(free, acceleration - self.acceleration.x.array[:n], 0.0)
         self.velocity.x.array[:n] = np.where(free, velocity, self.velocity.x.array[:n])
@@ -396,7 +396,7 @@ class Dynamics(given.Sealed):
         self._copy_committed()
 
     def _copy_committed(self) -> None:
-        """Displacement, velocity and acceleration as they are are those at the start of the next step."""
+        """Copy displacement, velocity and acceleration as initial values of the next step."""
         self._u = np.array(self._displacement)
         self._velocity, self._acceleration = np.array(self.velocity.x.array), np.array(self.acceleration.x.array)
 
@@ -407,7 +407,7 @@ class Dynamics(given.Sealed):
         return kept | ({"masses at points": [np.array(one.kept).tolist() for one in self.added]} if self.added else {})
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
-        """Go on from the Functions as they are and what ``to_checkpoint`` returned; other numbers may stand beside it."""
+        """Restart from the present Functions and the numbers of ``to_checkpoint``; other numbers are ignored."""
         names = "time", "start", "accelerated", "last length"
         self.time, self.start, self.accelerated, self._last = (kept[name] for name in names)
         self.resumed += 1
@@ -428,12 +428,12 @@ class Dynamics(given.Sealed):
         return self._weight.copy()
 
     def momentum(self) -> Array:
-        """Momentum ``(gdim,)``, of axisymmetric bodies that along the axis (collective)."""
+        """Momentum ``(gdim,)``; in axisymmetry only along the axis (collective)."""
         p = forms.product(self.mass.M, self._like(self.velocity.x.array[: self._n]))
         sums = reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0))
         return self.config.of_circles(sums + sum(one.momentum for one in self.added))
 
     def kinetic_energy(self) -> float:
-        """``v'Mv / 2``, and that of masses at points (collective)."""
+        """``v'Mv / 2``, plus the kinetic energy of masses at points (collective)."""
         v = self._like(self.velocity.x.array[: self._n])
         return 0.5 * float(v.dot(forms.product(self.mass.M, v))) + sum(one.kinetic_energy for one in self.added)

@@ -1,6 +1,6 @@
-"""Mass of the bodies, and bodies whose contactors are massless, so that impact itself loses no energy [UEM, 5].
+"""Mass of the bodies, and redistribution to massless contactors, so that impact itself loses no energy [UEM, 5].
 
-A density or nodal masses become a matrix with the layout of K.
+The mass matrix, from a density or nodal masses, has the layout of K.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class Mass:
     Attributes:
         M: with the layout and the block size of K.
         config: nodes and bodies; the displacement in it is not used.
-        diagonal: whether M holds nothing but its diagonal.
-        density: that M was made with, a UFL expression; None where masses were given at nodes.
+        diagonal: whether M is diagonal.
+        density: of M, a UFL expression; None for masses given at nodes.
     """
 
     M: PETSc.Mat
@@ -70,7 +70,7 @@ class Mass:
 
     @cached_property
     def of_nodes(self) -> Array:
-        """Diagonal of M at the owned nodes ``(n_owned, gdim)``: zero where a node is massless, else positive (collective)."""
+        """Diagonal of M at the owned nodes ``(n_owned, gdim)``: zero at massless nodes, otherwise positive (collective)."""
         diagonal = self.M.getDiagonal()
         values = np.array(diagonal.array_r).reshape(-1, self.config.gdim)
         diagonal.destroy()
@@ -94,7 +94,7 @@ class Mass:
         return self.config.of_circles(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
 
     def rigid(self) -> Array:
-        """What each body's rigid motions feel of M ``(n_bodies, n_rigid, n_rigid)`` (collective).
+        """Mass matrix of each body's rigid motions ``(n_bodies, n_rigid, n_rigid)`` (collective).
 
         Motions as in ``surfaces.rigid_velocities``: translations, then rotations about the mean of the body's nodes; the first
         block holds masses, the last one moments of inertia.
@@ -107,24 +107,24 @@ class Mass:
     def without(
         self, nodes: npt.ArrayLike, *, where_possible: npt.ArrayLike = (), distance: Callable[[], Array] | None = None
     ) -> Mass:
-        """The same bodies with some nodes massless, whose mass goes to the other nodes of their body (collective).
+        """The same bodies with some nodes massless, whose mass is moved to the other nodes of their body (collective).
 
-        With M0, which is M with zero rows and columns at these nodes, the new mass is ``S M0 S``, where S is diagonal and scales
-        component c of node i by ``max(1 + p_c(X_i), sqrt(1 - b))``. The polynomials p_c, of degree 2 in each body, are such that
-        mass, first and second moments ``x_a' M x_b`` of each component are kept, and so the momentum and the energy of every
-        motion whose velocity is linear in X, rigid ones among them. Nodes give up at most the part b of their own mass, and
-        ``S M0 S`` is at least ``(1 - b) M0`` in its eigenvalues. For diagonal M this redistributes nodal masses, after Khenous,
+        With M0, which is M with zero rows and columns at these nodes, the new mass is ``S M0 S``. S is diagonal and scales component c
+        of node i by ``max(1 + p_c(X_i), sqrt(1 - b))``. The polynomials p_c, of degree 2 in each body, preserve mass, first and second
+        moments ``x_a' M x_b`` of each component, and so the momentum and energy of every motion with a velocity linear in X, including
+        rigid motions. Nodes lose at most the part b of their own mass, and the eigenvalues of ``S M0 S`` are bounded from below by
+        those of ``(1 - b) M0``. For diagonal M this redistributes nodal masses, after Khenous,
         Laborde and Renard, "Mass redistribution method for finite element contact problems in elastodynamics", Eur. J. Mech.
         A/Solids 27 (2008) 918-932.
 
         Args:
-            nodes: owned local nodes ``(n,)``, e.g. the contactors; every rank names its own.
-            where_possible: owned local nodes ``(m,)`` that become massless as well in the bodies that can do without both.
-            distance: returns that of ``nodes`` from what they may touch ``(n,)``, a length, by which an error tells which part of
-                them could be massless (collective).
+            nodes: owned local nodes ``(n,)`` of this rank, e.g. the contactors.
+            where_possible: owned local nodes ``(m,)`` that become massless as well, in bodies whose other nodes can take the mass.
+            distance: returns the distance of ``nodes`` from the surfaces that they may touch ``(n,)``, a length; an error then names
+                the part of the nodes that could be massless (collective).
 
         Returns:
-            The new mass; this object itself if none of the nodes has any.
+            The new mass; this object itself if the nodes are massless already.
 
         Raises:
             MassError: if the other nodes of a body cannot take over the mass of ``nodes``, or a node is not owned.
@@ -164,15 +164,15 @@ class Mass:
         return Mass(M, config, self.diagonal, self.density)
 
     def _scaling(self, kept: Bools) -> tuple[Array, Bools]:
-        """Factors of the nodes that are kept with which these have the moments of all, and bodies that have none (collective).
+        """Factors of the nodes with mass that preserve the moments of each body, and bodies without such factors (collective).
 
         Newton's method for the coefficients of the polynomials, for every component of every body at once.
 
         Args:
-            kept: nodes that keep mass ``(n_owned,)``.
+            kept: mask of nodes that keep mass ``(n_owned,)``.
 
         Returns:
-            Factors ``(n_owned, gdim)``, and in which bodies the moments are missed ``(n_bodies,)``.
+            Factors ``(n_owned, gdim)``, and the mask of bodies whose moments are not preserved ``(n_bodies,)``.
         """
         g, xi = self.config.gdim, self._coordinates(kept)
         a, b = np.triu_indices(g + 1)
@@ -184,7 +184,7 @@ class Mass:
         xi = xi * kept[:, None, None]
 
         def evaluate(alpha: Array) -> tuple[Array, Array, Array]:
-            """Factors, moments that are missing as parts of what is wanted, and products whose sums are the derivatives."""
+            """Factors, relative errors of the moments, and products whose sums are the derivatives."""
             s = np.maximum(1.0 + np.einsum("nck,nck->nc", phi, alpha[body]), np.sqrt(1.0 - LARGEST_LOSS))
             moments, momenta = self._moments(xi, s)
             slopes = (xi[..., a] * momenta[..., b] + momenta[..., a] * xi[..., b]) * (s > np.sqrt(1.0 - LARGEST_LOSS))[..., None]
@@ -212,8 +212,8 @@ class Mass:
     def _coordinates(self, kept: Bools) -> Array:
         """1 and coordinates of the order of 1 at the nodes, for every component ``(n_owned, gdim, gdim + 1)`` (collective).
 
-        In every body they start from the centre of what is kept and follow its principal axes, in units of its spread along
-        these, so that polynomials in them are well told apart.
+        In every body they are measured from the centre of the kept mass along its principal axes, in units of its spread, so that
+        polynomials in them are well conditioned.
         """
         g, body = self.config.gdim, self._bodies[0]
         X = np.repeat(self._X[:, None], g, axis=1)
@@ -238,12 +238,12 @@ class Mass:
         return self._products(fields, momenta), momenta
 
     def _unable(self, here: Bools, needed: Bools, distance: Array | None) -> MassError:
-        """What to tell about a body that cannot do without some of its nodes' mass (collective).
+        """The error for a body whose other nodes cannot take the mass of some nodes (collective).
 
         Args:
-            here: nodes of the body ``(n_owned,)``.
-            needed: nodes of any body that should be massless ``(n_owned,)``.
-            distance: of these from what they may touch ``(n_owned,)``, or None.
+            here: mask of nodes of the body ``(n_owned,)``.
+            needed: mask of nodes of any body that should be massless ``(n_owned,)``.
+            distance: of these from the surfaces that they may touch ``(n_owned,)``, or None.
         """
         heavy = self.of_nodes.any(axis=1) & here
         sums = [here.sum(), (heavy & needed).sum(), (heavy & ~needed).sum(), *self._X[here].sum(axis=0)]
@@ -259,13 +259,13 @@ class Mass:
         )
 
     def _possible_part(self, needed: Bools, here: Bools, distance: Array) -> str:
-        """Which of the body's nodes could be massless, the nearest ones to what they may touch, in words (collective).
+        """Words for the body's nodes that could be massless: those nearest to the surfaces that they may touch (collective).
 
-        Arguments as those of ``_unable``.
+        Arguments as in ``_unable``.
         """
         comm, body = self.config.comm, self._bodies[0]
         number = reduced(comm, int(body[here].max(initial=-1)), op=MPI.MAX)
-        # equally near ones go together
+        # equally near nodes are treated together
         unit = EQUALLY_NEAR * self.config.size
         level = np.rint(distance / unit)
         levels = np.unique(np.concatenate(comm.allgather(level[needed])))
@@ -324,7 +324,7 @@ def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
             massless.
 
     Raises:
-        SpaceError: if V is no space of displacements, or rho lives on another mesh.
+        SpaceError: if V is no space of displacements, or rho is on another mesh.
         MassError: if rho is not scalar, not finite, or negative.
     """
     config = configuration_of(V)
@@ -340,8 +340,8 @@ def consistent_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
 def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     """Diagonal mass with the total of ``consistent_mass`` (collective).
 
-    Nodal masses are the row sums of the consistent mass. In a body where these are not all positive, as with quadratic triangles
-    and tetrahedra, every cell's mass goes to its nodes in proportion to the diagonal of its consistent mass (Hinton, Rock and
+    Nodal masses are the row sums of the consistent mass. In bodies where these are not all positive, e.g. with quadratic triangles
+    and tetrahedra, every cell's mass is distributed to its nodes in proportion to the diagonal of its consistent mass (Hinton, Rock and
     Zienkiewicz, Earthquake Engng. Struct. Dyn. 4 (1976) 245-249), taken on the reference cell.
 
     Args:
@@ -376,7 +376,7 @@ def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], n
     Args:
         V: space of the displacement.
         values: masses per node ``(n_owned,)``, or per node and component ``(n_owned, gdim)``, at this rank's owned nodes; or a
-            function of places in the reference configuration ``(n, gdim)`` that returns them, ``(n,)`` or ``(n, gdim)``.
+            function of reference positions ``(n, gdim)`` that returns them, ``(n,)`` or ``(n, gdim)``.
 
     Raises:
         SpaceError: if V is no space of displacements.

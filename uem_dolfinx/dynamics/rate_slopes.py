@@ -1,12 +1,12 @@
-"""How a time step depends on what it began with: derivatives of displacement, velocity and acceleration, backwards alone.
+"""Derivatives of a time step by its initial state: displacement, velocity and acceleration, in reverse mode only.
 
-With ``du = u(n+1) - u(n)`` all that a step makes of its end is linear in du, in the velocity v, the acceleration a and the mean
-velocity w that it began with, component by component: the acceleration b in the equation of motion, the velocity in the damping
-form, and v, a and w at its end. Beside these it hands on the inertia forces
+With ``du = u(n+1) - u(n)``, the results of a step are linear in du and in the initial velocity v, acceleration a and mean velocity w,
+component by component: the acceleration b in the equation of motion, the velocity in the damping form, and v, a and w at the end. The
+next step also depends on the inertia forces
 
     I(n+1) = (M b - alpha_f I(n)) / (1 - alpha_f)
 
-which its residual holds as well.
+which are a term of the residual, too.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class ByState:
-    """Derivatives by what a step begins with, at the owned components ``(n,)``.
+    """Derivatives by the initial state of a step, at the owned components ``(n,)``.
 
     Attributes:
         u, v, a, w: by displacement, velocity, acceleration and mean velocity.
@@ -38,13 +38,13 @@ class ByState:
 
 
 class RateSlopes:
-    """Derivatives through the time steps of a problem, handed back from the last to the first.
+    """Derivatives through the time steps of a problem, from the last to the first.
 
     Args:
         dynamics: of the problem.
 
     Attributes:
-        by: derivatives by what the step that was looked at last has left behind, then by what it began with; zero at first.
+        by: derivatives by the final state of the present step, and by its initial state after ``pass_back``; zero at first.
     """
 
     def __init__(self, dynamics: Dynamics):
@@ -53,7 +53,7 @@ class RateSlopes:
         self.by = ByState(*np.zeros((5, self._n)))
 
     def begin(self) -> None:
-        """Take the step that the dynamics are in, at the displacement that it has ended with."""
+        """Begin with the present step of the dynamics, at its final displacement."""
         d, s, dt, n = self._dynamics, self._dynamics.scheme, self._dynamics.dt, self._n
         _, last, _, u, (_, a, w, _), _ = d.memory()
         held, massy = d.held, d.massy.ravel()
@@ -61,19 +61,19 @@ class RateSlopes:
         a_end = self._rows(1.0 / (s.beta * dt**2), -1.0 / (s.beta * dt), 1.0 - 0.5 / s.beta)
         v_end = self._rows(v=1.0) + dt * ((1.0 - s.gamma) * self._rows(a=1.0) + s.gamma * a_end)
         slope = 2.0 * ((d.config.displacement.ravel() - u)[:n] / dt - w[:n]) / (dt + last)
-        # of prescribed components the smaller of two slopes, none where their signs differ
+        # for prescribed components the smaller of two slopes, zero if their signs differ
         some, less = slope * a[:n] > 0.0, np.abs(slope) < np.abs(a[:n])
         taken = (some & less) * 2.0 / (dt + last) * (mean - self._rows(w=1.0)) + (some & ~less) * self._rows(a=1.0)
         v_led = mean + 0.5 * dt * taken
         a_led = (v_led - self._rows(v=1.0)) / dt
         on = (0.5 - s.alpha_f) * 2.0 * dt / (dt + (last or dt))
         led = a_led + on * (a_led - self._rows(a=1.0))
-        #: Each by du, v, a and w ``(4, n)``.
+        #: Derivatives of each result by du, v, a and w ``(4, n)``.
         self._damped = np.where(held, v_led, v_end)
         self._b = np.where(held, led, (1.0 - s.alpha_m) * a_end + s.alpha_m * self._rows(a=1.0))
         self._v, self._w = np.where(massy, self._damped, mean), mean
         self._a = np.where(massy, np.where(held, a_led, a_end), 0.0)
-        #: What a change of the displacement does beyond what the tangent says, zero where components are free ``(n,)``.
+        #: Derivatives by the displacement that are not in the tangent, zero for free components ``(n,)``.
         self._more_b = np.where(held, self._b[0] - (1.0 - s.alpha_m) * a_end[0], 0.0)
         self._more_damped = np.where(held, self._damped[0] - v_end[0], 0.0)
 
@@ -86,27 +86,27 @@ class RateSlopes:
         return np.repeat(np.array([[du], [v], [a], [w]], dtype=float), self._n, axis=1)
 
     def _inertia(self, x: Array) -> Array:
-        """What inertia forces that count by ``x (n,)`` count by b (collective)."""
+        """Derivative by b, from derivatives ``x (n,)`` by the inertia forces (collective)."""
         return self._dynamics.mass.times(x.reshape(-1, self._dynamics.config.gdim)).ravel() / (
             1.0 - self._dynamics.scheme.alpha_f
         )
 
     def load(self) -> Array:
-        """Derivative through what the step has left behind by the displacement at its end ``(n,)`` (collective)."""
+        """Derivative by the final displacement of the step, through its final state ``(n,)`` (collective)."""
         by = self.by
         return by.u + self._v[0] * by.v + self._a[0] * by.a + self._w[0] * by.w + self._b[0] * self._inertia(by.forces)
 
     def beyond_tangent(self, a: Array, damped: Array | float) -> Array:
-        """What the transposed tangent lacks where displacements are prescribed ``(n,)`` (collective).
+        """Terms at prescribed displacements that are missing in the transposed tangent ``(n,)`` (collective).
 
         Args:
-            a: of the adjoint problem ``(n,)``.
-            damped: derivative of the work of damping along it by the velocity ``(n,)``; 0 without damping.
+            a: adjoint displacement ``(n,)``.
+            damped: derivative of the work of damping along a by the velocity ``(n,)``; 0 without damping.
         """
         return self._more_b * self._inertia(a) + self._more_damped * damped
 
     def pass_back(self, a: Array, damped: Array | float) -> None:
-        """Take derivatives by what the step began with; arguments as of ``beyond_tangent`` (collective)."""
+        """Compute derivatives by the initial state of the step; arguments as in ``beyond_tangent`` (collective)."""
         by, alpha = self.by, self._dynamics.scheme.alpha_f
         left = by.forces - a
         du, v, accelerated, w = (
@@ -115,20 +115,20 @@ class RateSlopes:
         self.by = ByState(-du, v, accelerated, w, -alpha / (1.0 - alpha) * left)
 
     def by_acceleration(self) -> Array:
-        """Derivative by the first acceleration ``(n,)``, which inertia forces follow (collective)."""
+        """Derivative by the first acceleration ``(n,)``, also through the inertia forces (collective)."""
         d = self._dynamics
         of_forces = d.mass.times(self.by.forces.reshape(-1, d.config.gdim)).ravel()
         return np.where(d.massy.ravel(), self.by.a + of_forces, 0.0)
 
     def by_density(self, a: Array) -> float:
-        """Derivative by the logarithm of a density that all mass follows, before it is passed back; ``a (n,)`` as there (collective)."""
+        """Derivative by the logarithm of a density of all mass, before ``pass_back``, with the same ``a (n,)`` (collective)."""
         d, alpha = self._dynamics, self._dynamics.scheme.alpha_f
         weight, before = d.weight().array_r, d.forces.x.array[: self._n]
         inertia = d.load().array_r + weight + alpha / (1.0 - alpha) * before
         return float(reduced(d.config.comm, float((self.by.forces - a) @ inertia + a @ weight)))
 
     def by_density_at_start(self, a: Array) -> float:
-        """Likewise through the first acceleration, with ``a (n,)`` of its adjoint problem (collective)."""
+        """Derivative by the same logarithm through the first acceleration, with ``a (n,)`` of its adjoint problem (collective)."""
         d = self._dynamics
         inertia, weight = d.mass.times(d.acceleration.x.array[: self._n].reshape(-1, d.config.gdim)).ravel(), d.weight().array_r
         return float(reduced(d.config.comm, float((self.by.forces - a) @ inertia + a @ weight)))

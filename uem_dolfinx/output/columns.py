@@ -1,4 +1,4 @@
-"""Columns of a history that a user asks for: reactions of supports, and quantities of the user's own."""
+"""Additional columns of a history: reactions of supports, and quantities defined by the user."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 class Columns:
-    """Numbers by name, asked for after every step (making it is collective).
+    """Numbers by name, evaluated after every step (the constructor is collective).
 
     Args:
-        problem: whose reactions are meant.
-        reaction: part of the mesh that Dirichlet conditions hold, as ``UnitedProblem.reaction`` takes it, or several by name; None
-            for none.
-        quantities: functions without arguments by name that return a number or a vector, the same on all ranks; None for none.
+        problem: for the reactions.
+        reaction: part of the mesh with Dirichlet conditions, as in ``UnitedProblem.reaction``, or several parts by name; or None.
+        quantities: functions without arguments by name that return a number or a vector, the same on all ranks; or None.
 
     Attributes:
         names: of the columns.
 
     Raises:
-        InputError, InputTypeError: for what is neither; for names that are given twice.
+        InputError, InputTypeError: for arguments of another form, and for duplicate names.
     """
 
     def __init__(self, problem: UnitedProblem, reaction: Any, quantities: Mapping[str, Callable[[], Any]] | None):
@@ -59,7 +58,7 @@ class Columns:
         return [f"{name}_{a}" for a in (self._axes if shape[0] == len(self._axes) else range(shape[0]))]
 
     def _values(self) -> dict[str, Array]:
-        """What the functions return now (collective)."""
+        """Present values of the functions (collective)."""
         found = {name: ask_together(self._comm, f"columns[{name!r}]", ask) for name, ask in self._asked.items()}
         with agreed(self._comm):
             for name, value in found.items():
@@ -71,11 +70,11 @@ class Columns:
         return found
 
     def row(self) -> list[float]:
-        """The numbers of all columns now (collective where there are any).
+        """The present numbers of all columns (collective if there are columns).
 
         Raises:
-            InputError, InputTypeError: if a function returns no finite numbers, other ones on other ranks, or more or fewer than at first.
-            UserFunctionError: if it raises an error.
+            InputError, InputTypeError: if a function returns numbers that are not finite, differ between ranks, or changed in number.
+            UserFunctionError: if a function raises an error.
         """
         if not self._asked:
             return []

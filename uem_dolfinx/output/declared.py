@@ -1,4 +1,4 @@
-"""What a problem declares, gathered to rank 0 for a sketch: bodies, surfaces that meet, what is held, prescribed and loaded, as drawn."""
+"""Declarations of a problem in the reference configuration, gathered to rank 0 for a sketch: bodies, contacts, conditions, loads."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 @dataclass(frozen=True)
 class Surface:
-    """One side of a contact, of a tie, or of what else is declared of surfaces, on rank 0.
+    """One side of a contact, tie or other declaration of surfaces, on rank 0.
 
     Attributes:
-        name: what the legend calls it.
-        side: ``"contactor"``, also for what else follows; or ``"target"``, also for what else is followed.
-        pair: number of the declaration, which both sides have in common.
+        name: label in the legend.
+        side: ``"contactor"``, also for other following surfaces; or ``"target"``, also for other followed surfaces.
+        pair: number of the declaration, the same for both sides.
         corners: vertices around each facet ``(m, k, gdim)``.
         normals: outward unit normals of the facets ``(m, gdim)``.
-        points: nodes, where there are no facets ``(n, gdim)``.
-        layer: how many of those before are the same part of the mesh.
+        points: nodes, for parts without facets ``(n, gdim)``.
+        layer: number of earlier surfaces on the same part of the mesh.
     """
 
     name: str
@@ -51,11 +51,11 @@ class Rigid:
     """A rigid target, on rank 0.
 
     Attributes:
-        name: what the legend calls it.
-        pair: as of ``Surface``.
-        shape: where it is.
-        at: its point that is nearest to the contactors' middle ``(gdim,)``.
-        way: from there to where loads take it ``(gdim,)``.
+        name: label in the legend.
+        pair: as in ``Surface``.
+        shape: with its position.
+        at: its point nearest to the contactors' middle ``(gdim,)``.
+        way: displacement of this point by the loads ``(gdim,)``.
     """
 
     name: str
@@ -67,14 +67,14 @@ class Rigid:
 
 @dataclass(frozen=True)
 class Declared:
-    """Everything, on rank 0.
+    """All declarations, on rank 0.
 
     Attributes:
-        cells: vertices around each cell of a 2D scene, or around each facet on the outside of a 3D one ``(n, k, gdim)``.
+        cells: vertices around each cell in 2D, or around each surface facet in 3D ``(n, k, gdim)``.
         body: of each of these ``(n,)``, counted in the order of the mesh's input.
-        outside: facets on the outside ``(m, k, gdim)``.
+        outside: surface facets ``(m, k, gdim)``.
         clamped: facets that are held in all components ``(m, k, gdim)``, and their outward normals ``(m, gdim)``.
-        surfaces, rigid, acting: what is declared of surfaces and points.
+        surfaces, rigid, acting: declarations of surfaces, rigid targets and points.
         axis: whether x = 0 is an axis of revolution.
     """
 
@@ -89,12 +89,12 @@ class Declared:
 
 
 class Declarations:
-    """Takes what a problem declares, in the reference configuration (making one is collective).
+    """Collects the declarations of a problem, in the reference configuration (the constructor is collective).
 
     Args:
-        problem: the scene.
-        at: load factor or time whose loads are taken; None takes those there are.
-        loads: whether loads that are terms of the residual are asked for.
+        problem: the problem.
+        at: load factor or time of the loads; None for the present loads.
+        loads: whether loads that are terms of the residual are included.
 
     Attributes:
         found: on rank 0, None elsewhere.
@@ -140,7 +140,7 @@ class Declarations:
             )
 
     def _declare_surfaces(self) -> None:
-        """Note both sides of contacts and ties (collective)."""
+        """Collect both sides of contacts and ties (collective)."""
         for one in [*self.problem.declared, *self.problem.ties]:
             if isinstance(one, GeneralContact):
                 self._add(f"{one.name}: all surfaces", "contactor", one.all_surfaces)
@@ -150,13 +150,13 @@ class Declarations:
                 if not hasattr(one.target, "project"):
                     self._add(self._called(one, one.target, words[1]), "target", one.target)
                 for surface in self._surfaces[-2:] if preload else ():
-                    # both parts are drawn to each other
+                    # both parts are pulled towards each other
                     n = surface.normals.mean(axis=0, keepdims=True)
                     self._acting.found.append(Acting("load", "preload", surface.corners.mean(axis=(0, 1))[None], n, -n))
             self._pairs += 1
 
     def _called(self, contact: Contact, part: Part, word: str) -> str:
-        """Name of one side of a contact: that of its tag if it has one, with that of the contact where others have the same."""
+        """Name of one side of a contact: the name of its tag, with the name of the contact if other contacts use the same tag."""
         name = name_of(part)
         if name == "by index" or name.startswith("tagged "):
             return f"{contact.name}: {word}"
@@ -166,7 +166,7 @@ class Declarations:
         return f"{name}: {word}" + (f" ({contact.name})" if len(several) > 1 else "")
 
     def _equations(self) -> None:
-        """Note periodic surfaces, and nodes of linear equations (collective)."""
+        """Collect periodic surfaces, and nodes of linear equations (collective)."""
         for k, one in enumerate(self.problem.equations):
             follower, *leaders = one.places
             sides = [
@@ -183,7 +183,7 @@ class Declarations:
                 self._acting.act("equation", "linear equation", at, np.zeros_like(at))
 
     def _add(self, name: str, side: str, part: Part) -> None:
-        """Note a surface, or points (collective)."""
+        """Collect a surface, or points (collective)."""
         tag = as_tag(part, self.mesh, (self.config.tdim - 1, 0), name)
         if tag.dim == self.config.tdim - 1:
             found = self._outside.gather(*self._outside.facets(part=tag), np.zeros((0, self.gdim)))
@@ -200,7 +200,7 @@ class Declarations:
         return [target.motion for _, target, _ in self._rigid_targets()]
 
     def _rigid_targets(self) -> list[tuple[int, RigidSurface, Contact]]:
-        """Rigid surfaces with the numbers of their declarations, each once, and a contact of theirs."""
+        """Distinct rigid surfaces, each with the number of its declaration and one of its contacts."""
         found: dict[int, tuple[int, RigidSurface, Contact]] = {}
         for k, one in enumerate(self.problem.declared):
             for contact in one.parts if isinstance(one, GeneralContact) else [one]:
@@ -209,7 +209,7 @@ class Declarations:
         return list(found.values())
 
     def _rigid(self, before: Sequence[Motion | None], after: Sequence[Motion | None]) -> list[Rigid]:
-        """Rigid targets and where they go (collective)."""
+        """Rigid targets and their displacements (collective)."""
         found, still = [], Motion.none(self.gdim)
         for (k, target, contact), first, last in zip(self._rigid_targets(), before, after):
             nodes = contact.pair.nodes
@@ -225,12 +225,12 @@ class Declarations:
 
 
 def _words(contact: Contact) -> tuple[str, str]:
-    """What the legend calls the sides of a contact."""
+    """Labels of the sides of a contact in the legend."""
     if isinstance(contact, Preload):
         return "preloaded", "preloaded"
     return ("tied", "tied to") if contact.tied is True else ("contactor", "target")
 
 
 def _target(contact: Contact) -> str:
-    """Name of the part of a mesh that is a contact's target; none of a rigid one."""
+    """Name of the part of a mesh that is a contact's target; empty for a rigid target."""
     return "" if hasattr(contact.target, "project") else name_of(contact.target)

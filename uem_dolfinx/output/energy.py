@@ -1,4 +1,4 @@
-"""Energy log: where the energy of a run is after every step, what work was done, and the momentum beside."""
+"""Energy balance: energies, works and momenta of a run after every step."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ class Energies:
 
 
 class EnergyBook(Closing, given.Sealed):
-    """Book of energies and momenta, one row per time step, as a table in a CSV file if wanted.
+    """Energy balance and momenta, one row per time step, optionally as a CSV file.
 
-    Columns: those of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... that the
-    contactor's body has received. Works are integrated by the trapezoidal rule.
+    Columns: the fields of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... on the
+    contactor's body. Works are integrated by the trapezoidal rule.
 
     Args:
         problem: with ``dynamics``.
-        stored: energy of the bodies' strain as a UFL form; that of materials with history is added.
+        stored: strain energy of the bodies as a UFL form; the energy of materials with history is added.
         external: virtual work of the external forces as a UFL form, linear in a test function: the terms with a minus sign in F.
             Loads and springs at nodes, and linear equations, are included by default.
         path: name of the CSV file; None writes none.
@@ -104,7 +104,7 @@ class EnergyBook(Closing, given.Sealed):
         self.table = None if path is None else CsvTable(path, problem.comm, columns, resume_at, whose="an EnergyBook")
         begin = {} if self.table is None else self.table.last
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
-        # contacts that were read from a checkpoint know what friction had taken before
+        # contacts read from a checkpoint include earlier frictional dissipation
         self._before = begin.get("friction", 0.0) - sum(c.dissipation for c in problem.contacts)
         impulse = [begin.get(f"impulse_{a}{s}", 0.0) for s in suffixes for a in axes]
         self._impulse = np.reshape(impulse, (len(suffixes), len(axes)))
@@ -113,10 +113,10 @@ class EnergyBook(Closing, given.Sealed):
                 "%s ends at time %.6g and is gone on with at %.6g: the work in between is missing; write a row after every step",
                 path, begin["time"], self.dynamics.time,
             )  # fmt: skip
-        # the work of the first step begins with the load of this instant
+        # the work of the first step uses the initial load, too
         problem.set_load(self.dynamics.time)
         self._read_forces()
-        # the sum at the start, from which the defect is counted
+        # the initial sum, for the defect
         if self.table is not None and begin:
             self._first = sum(self.table.first[name] for name in ("kinetic", "stored", "dissipated"))
         else:
@@ -130,7 +130,7 @@ class EnergyBook(Closing, given.Sealed):
         self._u, self._time, self._driven = u, self.dynamics.time, self.dynamics.driven
         contact = sum((c.force.x.array[:n] for c in problem.contacts), np.zeros(n))
         problem.bodies.assemble()
-        # the work of supports on mass, where velocities jump, is what the mass has got
+        # the work of supports on mass, with jumps of velocity, is the change of its kinetic energy, see ``driven``
         driving = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
         reaction = (driving - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
@@ -138,7 +138,7 @@ class EnergyBook(Closing, given.Sealed):
         if problem.bodies.points is not None:
             outer += problem.bodies.points.loads().ravel()
         if added := self.dynamics.added:
-            # what masses at points do to their couplings, these do to them
+            # forces of masses at points on their couplings, with the opposite sign
             outer -= self.dynamics.added_forces(carried=True)
         #: Forces from outside on these masses, and their displacements.
         self._at_points = [(one.pushed, one.places) for one in added]
@@ -163,10 +163,10 @@ class EnergyBook(Closing, given.Sealed):
         return self.dynamics.kinetic_energy(), stored, dissipated
 
     def write(self, step: TimeStep | None = None) -> Energies:
-        """Enter the present state; call it after every step (collective).
+        """Append the present state; call it after every step (collective).
 
         Args:
-            step: what was stepped; the book reads the problem, so that it may be left out.
+            step: the step, not used and optional.
 
         Returns:
             The new row.
@@ -195,7 +195,7 @@ class EnergyBook(Closing, given.Sealed):
         return row
 
     def plot(self, panel: Any) -> None:
-        """Draw the energies over time into a panel of :func:`uem_dolfinx.figure`; None, where rank is not 0, draws nothing."""
+        """Plot the energies over time in a panel of :func:`uem_dolfinx.figure`; nothing for None, as on ranks other than 0."""
         if panel is None:
             return
         t = [row.time for row in self.rows]
@@ -203,7 +203,7 @@ class EnergyBook(Closing, given.Sealed):
         total = [sum(getattr(row, name) for name in kept) - row.external for row in self.rows]
         for name in (*kept, "external", "contact", "friction"):
             values = [getattr(row, name) for row in self.rows]
-            # what is never worth a line stays out
+            # negligible quantities are not plotted
             if max(map(abs, values)) > 1e-6 * max(map(abs, total)):
                 panel.plot(t, values, label=name, ls="--" if name in ("external", "contact", "friction") else "-")
         panel.plot(t, total, "k", lw=1.2, label="sum less external work")

@@ -1,4 +1,4 @@
-"""What a ``UnitedProblem`` has committed, kept so that a step can be taken once more from the state it began with."""
+"""Copies of the committed state of a ``UnitedProblem``, so that a step can be repeated from its initial state."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from uem_dolfinx.solve.united.newton import Iteration
 
 @dataclass(frozen=True)
 class Memory:
-    """The committed state of a problem: all that its next step begins with.
+    """The committed state of a problem, from which its next step begins.
 
     Attributes:
         displacement: ``(n_local incl. ghosts,)``.
         largest_forces: norm of the largest forces so far.
         motions: of the pairs' rigid targets.
-        pairs: what each pair remembers.
+        pairs: state of each pair.
         histories: of the materials, values by name.
-        stiffness: diagonal of K ``(n_owned, block)``, from which contacts take directions before K is made anew; None at first.
-        dynamics: what these remember, None in statics.
+        stiffness: diagonal of K ``(n_owned, block)``, which contacts use for directions before K is assembled again; None at first.
+        dynamics: state of the dynamics, None in statics.
     """
 
     displacement: Array
@@ -41,7 +41,7 @@ class Memory:
 
     @classmethod
     def of(cls, problem: Any) -> Memory:
-        """What the problem has committed last."""
+        """The last committed state of the problem."""
         return cls(
             displacement=problem.committed,
             largest_forces=problem.largest_forces,
@@ -53,7 +53,7 @@ class Memory:
         )
 
     def put_back(self, problem: Any) -> None:
-        """Make it the problem's committed and present state again (collective)."""
+        """Restore it as the problem's committed and present state (collective)."""
         problem.committed, problem.largest_forces, problem.motions = self.displacement, self.largest_forces, self.motions
         move_targets(problem, self.motions)
         for material, kept in zip(problem.materials, self.histories):
@@ -68,7 +68,7 @@ class Memory:
 
 
 def move_targets(problem: Any, motions: list[Motion | None]) -> None:
-    """Put the pairs' rigid targets where these motions take them."""
+    """Set the motions of the pairs' rigid targets."""
     for pair, motion in zip(problem.interfaces, motions):
         if pair.target.motion is not motion:
             pair.target.motion = motion

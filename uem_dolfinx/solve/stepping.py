@@ -1,4 +1,4 @@
-"""What load steps and time steps share: how far a problem is, and what is done between steps, on signals and for checkpoints."""
+"""Common parts of load steps and time steps: progress of a problem, and actions between steps, on signals and for checkpoints."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ S = TypeVar("S", bound="ConvergedStep")
 
 
 class ConvergedStep:
-    """What is told of every converged step, from its history of the Newton loop."""
+    """Base of converged steps, with numbers from their Newton iterations."""
 
     iterations: list[Iteration]
     cuts: int
@@ -47,7 +47,7 @@ class ConvergedStep:
         return sum(i.exchanges for i in self.iterations)
 
     def __repr__(self) -> str:
-        """All that is not as by default but the history, of which the numbers of iterations and exchanges."""
+        """Attributes that differ from their defaults, and the numbers of iterations and active-set changes."""
         shown = {
             name: value
             for name, value in vars(self).items()
@@ -68,29 +68,28 @@ class ConvergedStep:
 
 @dataclass
 class Progress:
-    """How far a problem is, in steps and in load.
+    """Progress of a problem in steps and in load.
 
     Attributes:
-        steps: converged and committed.
-        resumed: how often a checkpoint has been read into it.
-        ramp: the call of ``load_steps`` that has brought the load where it is, counted from 1; 0 before the first.
+        steps: number of converged and committed steps.
+        resumed: number of checkpoints that have been read.
+        ramp: number of the present call of ``load_steps``, counted from 1; 0 before the first.
         factor: load factor reached in it.
         start: displacement at its beginning ``(n_local incl. ghosts,)``; with arc lengths at the beginning of its last step.
-        reach: arc length of the whole call, were all of it like its first step; 0 without arc lengths.
+        reach: arc length of the whole call, extrapolated from its first step; 0 without arc lengths.
         control: length of its steps.
-        interruption: signals that are noted while the problem steps.
-        end: ends the run on a signal of a number, once the problem is in its last converged state.
-        inside: whether a step has been handed out, and the caller is not done with it.
-        step: name of the ``Step`` that this call is.
+        interruption: signals that are noted during steps.
+        end: ends the run on a signal of a given number, once the problem is in its last converged state.
+        inside: whether the caller works on a step, in the body of the loop.
+        step: name of the ``Step`` of this call.
         loads: values of its Constants at its beginning.
-        carried: what it releases: forces at all unknowns at its beginning, ghosts included ``(n,)``; None for nothing.
-        of_equations: multipliers of equations of users at the components that these eliminate, as a checkpoint has kept them
-            ``(n_local, gdim)``.
-        taken: how much of a change of given values the committed state has taken.
-        began: likewise at the beginning of the call.
-        left: load factors at which calls of several ``Step`` were left before their end, and none of their later steps begun, by the
-            number of the call that each of these counts as.
-        number: that tells the problem from others of this script, which its steps have as ``_of_problem``.
+        carried: released forces at all unknowns at its beginning, ghosts included ``(n,)``; None if zero.
+        of_equations: multipliers of equations of users at their eliminated components, from a checkpoint ``(n_local, gdim)``.
+        taken: shares of the committed state, see ``solve.taken``.
+        began: shares at the beginning of the call.
+        left: load factors at which lists of several ``Step`` were left before their end, by the number of the call of each step that
+            was left or skipped.
+        number: identifies the problem in this script; its steps have it as ``_of_problem``.
     """
 
     steps: int = 0
@@ -115,18 +114,18 @@ class Progress:
 
     @property
     def time(self) -> float:
-        """Clock of tables that are ordered by steps."""
+        """Number of steps, as clock of tables that are ordered by steps."""
         return self.steps
 
     @property
     def ahead(self) -> int:
-        """The next call of ``load_steps``, counted from the one that the problem is in: below 0 if that comes later."""
+        """Number of the next call of ``load_steps`` relative to the problem's present call; negative if that is a later one."""
         return self._calls + 1 - self.ramp
 
     def left_at(self) -> float | None:
-        """Load factor at which the next call was left, and its list of steps with it, before a checkpoint that is beyond it; else None.
+        """Load factor at which the next call, with its list of steps, was left before a checkpoint of a later call; else None.
 
-        One that is begun or gone on with has yet to be left.
+        The entry of a call that is begun or continued is removed.
         """
         number = self._calls + 1
         if number < self.ramp:
@@ -135,10 +134,10 @@ class Progress:
         return None
 
     def begin_ramp(self, displacement: Array, steps: int) -> bool:
-        """Begin a call of ``load_steps`` with so many steps, or go on with the one that a checkpoint was written in.
+        """Begin a call of ``load_steps`` with a number of steps, or continue the call in which a checkpoint was written.
 
         Returns:
-            Whether there is anything to do; not where the checkpoint was written in a later call.
+            Whether the call has steps to take; False if the checkpoint was written in a later call.
         """
         self._calls += 1
         if self._calls > self.ramp:
@@ -150,11 +149,11 @@ class Progress:
         return self._calls == self.ramp
 
     def take_shares(self, began: Taken, taken: Taken) -> None:
-        """Take shares at the beginning of the call, and now, of steps that were made before."""
+        """Set the shares at the beginning of the call, and the present ones, from earlier steps."""
         self.began, self.taken = began, taken
 
     def check_signals(self, comm: MPI.Comm) -> None:
-        """Raise ``InterruptedStepError`` on all ranks if any has got a signal since the stepping began (collective)."""
+        """Raise ``InterruptedStepError`` on all ranks if any rank has received a signal during stepping (collective)."""
         if self.interruption is not None:
             self.interruption.check_signals(comm)
 
@@ -176,7 +175,7 @@ class Progress:
             self.interruption = outer
 
     def to_checkpoint(self, ramped: bool) -> dict[str, Any]:
-        """Numbers that a run goes on from, by name; those of load steps if ``ramped``."""
+        """Numbers for a checkpoint, by name; with the numbers of load steps if ``ramped``."""
         load: dict[str, Any] = {}
         if ramped:
             ramp = [self.ramp, *map(list, self.left.items())] if self.left else self.ramp
@@ -189,7 +188,7 @@ class Progress:
         return {"steps committed": self.steps} | load | (self.control.to_checkpoint() if ramped else {})
 
     def from_checkpoint(self, kept: dict[str, Any], start: Array | None, carried: Array | None) -> None:
-        """Go on from what ``to_checkpoint`` returned, load steps from the displacement and what they release at their beginning."""
+        """Restore numbers from ``to_checkpoint``; for load steps also the initial displacement and the released forces."""
         self.steps = kept["steps committed"]
         self.resumed += 1
         if start is not None:
@@ -199,15 +198,15 @@ class Progress:
             self.start, self.step, self.loads = np.array(start), kept["name of the step"], kept["loads at its beginning"]
             self.carried = carried if kept["releases forces"] else None
             self.control.from_checkpoint(kept)
-            # a script that is run anew comes to this call of load_steps once more
+            # a restarted script makes this call of load_steps again
             self._calls = max(0, min(self._calls, self.ramp - 1))
 
 
 def begin_checkpoint(checkpoint: Checkpoint | None, state: Callable[[], State], u: Any) -> None:
-    """Begin a checkpoint unless the caller has, with a state that has the displacement (collective).
+    """Begin a checkpoint, unless the caller has begun it with a state of this displacement (collective).
 
     Raises:
-        CheckpointError: as ``Checkpoint.begin``, or if it has begun with the state of another problem.
+        CheckpointError: as in ``Checkpoint.begin``, or if it has begun with the state of another problem.
     """
     if checkpoint is None:
         return
@@ -224,25 +223,25 @@ def between_steps(
     checkpoint: Checkpoint | None,
     contacts: Sequence[Contact | GeneralContact],
 ) -> Iterator[S]:
-    """Steps, between which the checkpoint is written when it is time, and on a signal to any rank, which ends the run on all.
+    """Steps, between which the checkpoint is written when due, and on a signal to any rank, which ends the run on all ranks.
 
-    Each is told of in a line of the log, where the application wants to hear what is of level INFO.
+    Each step is logged in one line at level INFO, if the application enables this level.
 
     Args:
         comm: communicator of the problem.
-        progress: of the problem, by which it checks signals within a step, too.
-        contacts: of the problem, as they were declared.
-        steps: each brings the problem from one committed state to the next; where it raises, the last one is restored.
-        checkpoint: which has begun; None writes none.
+        progress: of the problem, for signals within a step, too.
+        contacts: of the problem, as declared.
+        steps: each brings the problem from one committed state to the next; on errors the last state is restored.
+        checkpoint: which has begun, or None.
 
     Yields:
         The steps.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C, with the last committed state in the problem and in the checkpoint.
-        SystemExit: likewise with status 143 after SIGTERM.
-        CheckpointError: if the checkpoint cannot be written. On any other error, and where the caller leaves the loop, the last
-            committed state is in it, too.
+        SystemExit: with status 143 after SIGTERM, with the same states.
+        CheckpointError: if the checkpoint cannot be written. On any other error, and if the caller leaves the loop, the last
+            committed state is written, too.
     """
     told = comm.bcast(logger.isEnabledFor(logging.INFO))
     outer = progress.interruption, progress.end
@@ -257,7 +256,7 @@ def between_steps(
                 for step in steps:
                     if told:
                         logger.info("%s", step.summary(contacts))
-                    # steps are frozen but for this
+                    # steps are frozen, except for this attribute
                     object.__setattr__(step, "_of_problem", progress.number)
                     progress.inside = True
                     if checkpoint is not None:
