@@ -155,8 +155,8 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
     """Value of a functional, as in ``uem.integrate(p * uem.ds(tags["top"]))``, summed over all ranks (collective).
 
     Args:
-        integrals: in UFL, on a mesh declared ``axisymmetric`` over whole circles; or compiled by ``fem.form``, which saves time where it
-            is asked for again and again, over what is in the form.
+        integrals: in UFL, on a mesh declared ``axisymmetric`` over whole circles; or compiled by ``fem.form``, which saves time for
+            repeated evaluation, but is integrated as it is.
 
     Raises:
         InputError, InputTypeError: for anything else, or a form with a test function or without integrals.

@@ -1,13 +1,13 @@
-"""The united matrix ``Q'(K + G)P`` from its changes: K's values in a pattern that lasts, and products near the contact only.
+"""The constrained matrix ``Q'(K + G)P`` by updates: K's values in a persistent pattern, and products near the contact only.
 
-P and Q are the identity in free components but for the rows of eliminated nodes, P_E and Q_E. With K_E, the rows of these nodes, and Z,
-which crosses out their components and those that are prescribed,
+P and Q are the identity in free components except for the rows of eliminated nodes, P_E and Q_E. With K_E, the rows of these nodes, and
+Z, which crosses out their components and prescribed components,
 
     Q'KP = ZKZ + ZK P_E + Q_E'K_E (Z + P_E)
 
-so that only blocks of these nodes and their neighbours are multiplied, by each rank its own rows, and all that grows with the bodies is a
-copy of values. Entries of K go line by line to where the matrix has them, in one piece between lines that have more; prescribed components
-are crossed out there, but for the diagonal.
+so that only blocks of these nodes and their neighbours are multiplied, by each rank for its own rows. Only a copy of values grows with the
+size of the bodies. Entries of K are copied in contiguous pieces between lines with additional entries; prescribed components are crossed
+out afterwards, except for the diagonal.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ KEPT_PLACES = 2.0
 
 
 def made_of(P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, roughly: bool) -> tuple[Any, ...] | None:
-    """K and numbers that tell ``Q'(K + G)P`` from others; None where it is taken for a new one in any case (collective).
+    """Fingerprint of ``Q'(K + G)P``: K and numbers; None if the matrix counts as new in any case (collective).
 
     Args:
         P: trial rows.
         Q: test rows.
-        K: the tangent, told by the state of its values.
+        K: the tangent, identified by the state of its values.
         G: the curvature.
-        roughly: whether coefficients of P and Q, and values of G, do not count.
+        roughly: whether coefficients of P and Q, and values of G, are ignored.
     """
     if not roughly and (G is not None or Q is not P):
         return None
@@ -47,36 +47,36 @@ def made_of(P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, r
 
 
 class UnitedMatrix:
-    """``Q'(K + G)P`` of one K after the other, in the same matrix while its entries keep their places.
+    """``Q'(K + G)P`` for successive K, in the same matrix as long as its sparsity is unchanged.
 
     Args:
         space: the space that K acts on.
-        reserving: whether equations that do not hold have their places too.
+        reserving: whether the sparsity includes inactive equations.
     """
 
     def __init__(self, space: Nodes, reserving: bool):
         self.space, self.reserving = space, reserving
         self._first, self._n = space.block * space.first, space.block * space.n_owned
         self._size = space.n_global
-        #: K and the free components that the matrix was made for, and the state of K's values that it holds.
+        #: K and the free components that the matrix was made for, and the state of K's values in it.
         self._made_for: tuple[Any, ...] = ()
         self._state = -1
-        #: Entries of K, of a copy where it has arrays of its own, and of the matrix.
+        #: Entries of K, or of a copy of K, and of the matrix.
         self._K: Any = None
         self._A: Any = None
-        #: Keys of the blocks that K lacks, line of nodes times their number plus column, sorted.
+        #: Sorted keys of the additional blocks that K does not have: line of nodes times their number plus column.
         self._filled: Ints = np.zeros(0, np.int64)
         #: Whether a step begins.
         self._begins = False
-        #: Where the last update changed what is K's: blocks and places of their lines, places of single entries in the matrix and in K.
+        #: Entries of K changed by the last update: blocks, positions of their lines, positions of single entries in matrix and K.
         self._changed: tuple[Blocks, Ints, Ints, Ints] | None = None
 
     def begin_step(self) -> None:
-        """Let no place depend on the steps before this one: a run that goes on from a checkpoint takes the same."""
+        """Make the sparsity independent of earlier steps, so that a run restarted from a checkpoint has the same."""
         self._begins = True
 
     def update(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> PETSc.Mat:
-        """Give the matrix its values for this P and Q, with the diagonal of K in idle columns (collective)."""
+        """Compute the matrix for this P and Q, with the diagonal of K in idle columns (collective)."""
         with timed("restriction matrix P"):
             trial = P.rows()
             test = trial if P is Q else Q.rows()
@@ -88,7 +88,7 @@ class UnitedMatrix:
             return self._A.mat
 
     def _fill(self, P: Restriction, Q: Restriction, trial: Blocks, test: Blocks, G: Blocks | None) -> None:
-        """Bring K's values and the products into the matrix (collective)."""
+        """Copy K's values and the products into the matrix (collective)."""
         changes, adding = self._changes(trial, test, G)
         begins = self._A is None or self._begins
         lines, there = self._find(self._K if begins else self._A, changes)
@@ -106,7 +106,7 @@ class UnitedMatrix:
         self._A.mat.assemble()
 
     def _bring_values(self) -> None:
-        """Bring K's values into the matrix, or back, as those of ZKZ, with the diagonal of K where it is crossed out (collective)."""
+        """Copy or restore the values of ZKZ in the matrix, with the diagonal of K in crossed-out components (collective)."""
         values, g = self._A.values, self.space.block
         if self._changed is None:
             for to, here in self._runs:
@@ -125,17 +125,17 @@ class UnitedMatrix:
         values[held] = self._stiff(own)
 
     def _stiff(self, places: Ints) -> Array:
-        """Entries of K at ``places (k,)`` of its diagonal, a large one where there is none, as in bodies that are rigid ``(k,)``."""
+        """Diagonal entries of K at ``places (k,)``; zeros, as in rigid bodies, are replaced by a large value ``(k,)``."""
         own = self._K.values[places]
         return own if own.all() else np.where(own != 0.0, own, np.abs(self._K.values).max(initial=0.0) or 1.0)
 
     def _changes(self, trial: Blocks, test: Blocks, G: Blocks | None) -> tuple[Blocks, Bools]:
-        """Blocks of the products in owned rows, each place once, and which of them are added to what K has there ``(k,)`` (collective).
+        """Blocks of the products in owned rows, without duplicates, and the mask of blocks to add to K's values ``(k,)`` (collective).
 
         Args:
-            trial: rows of P at this rank's eliminated nodes; each has a block of its own.
+            trial: rows of P at this rank's eliminated nodes, each with a diagonal block.
             test: rows of Q there.
-            G: curvature in owned rows, if any.
+            G: curvature in owned rows, or None.
         """
         space, first, last = self.space, self.space.first, self.space.first + self.space.n_owned
         own = np.unique(trial.row)
@@ -157,7 +157,7 @@ class UnitedMatrix:
         return changes, ~(eliminated[changes.row - first] | np.isin(changes.column, seen))
 
     def _handed_on(self, trial: Blocks, coupled: Blocks) -> Blocks:
-        """Rows of P at eliminated nodes of this rank, and at those of others that are ``coupled`` with nodes here (collective)."""
+        """Rows of P at eliminated nodes of this rank, and at eliminated nodes of other ranks ``coupled`` with owned nodes (collective)."""
         comm = self.space.comm
         if comm.size == 1:
             return trial
@@ -169,7 +169,7 @@ class UnitedMatrix:
     # -- blocks of K and of curvature --------------------------------------------------------------------------------------
 
     def _inside(self, nodes: Ints, columns: Bools | None = None) -> Blocks:
-        """Blocks of ZKZ in rows and columns of owned nodes, in rows ``nodes (k,)``, and in some ``columns (n_owned,)`` alone if told."""
+        """Blocks of ZKZ in rows and columns of owned nodes: rows ``nodes (k,)``, optionally only in a mask ``columns (n_owned,)``."""
         g, first = self.space.block, self.space.first
         places, i, width = blocks_of(nodes, self._K.indptr, g)
         column = self._K.columns[places] // g
@@ -182,13 +182,13 @@ class UnitedMatrix:
         )
 
     def _outside(self, which: Bools) -> Blocks:
-        """Some of the blocks of ZKZ in owned rows and other ranks' columns, of which ``_beyond`` has the places."""
+        """Blocks of ZKZ in owned rows and other ranks' columns, for a mask of the blocks in ``_beyond``."""
         there = self._beyond.some(which)
         free = self._made_for[1][there.row - self.space.first]
         return there._replace(value=self._values(*there.value.T.astype(np.int64), free, self._free_beyond[which]))
 
     def _values(self, places: Ints, width: Ints, *free: Bools) -> Array:
-        """Values of blocks of ZKZ: from the places where K has them, the entries in their lines, and ``free (k, g)`` rows and columns."""
+        """Values of blocks of ZKZ, from their positions in K, the lengths of their lines, and ``free (k, g)`` rows and columns."""
         there = self._K.values[_along(_lines(places, width, self.space.block), self.space.block)]
         return np.asarray(there * free[0][:, :, None] * free[1][:, None, :])
 
@@ -200,7 +200,7 @@ class UnitedMatrix:
         return Blocks(row, column, value * free[row - self.space.first][:, :, None] * there[:, None, :])
 
     def _find(self, entries: Entries, blocks: Blocks) -> tuple[Ints, Bools]:
-        """Places of the lines of blocks in owned rows ``(k, g)``, and whether the blocks are there ``(k,)``."""
+        """Positions of the lines of blocks in owned rows ``(k, g)``, and whether the blocks exist ``(k,)``."""
         g = self.space.block
         inside = self.space.owner_of(blocks.column) == self.space.comm.rank
         line = g * blocks.row - self._first + np.where(inside, 0, self._n)
@@ -208,7 +208,7 @@ class UnitedMatrix:
         return _lines(places, entries.indptr[line + 1] - entries.indptr[line], g), there
 
     def _know(self, P: Restriction, K: PETSc.Mat) -> bool:
-        """Take K's places if they are new; whether its values are (collective)."""
+        """Set the sparsity of K if it is new; whether its values are new (collective)."""
         same = bool(self._made_for) and self._made_for[0] == K and np.array_equal(self._made_for[1], P.free)
         fresh, changed = reduced(self.space.comm, np.array([not same, not same or self._state != K.stateGet()], dtype=np.int64))
         if fresh:
@@ -219,16 +219,16 @@ class UnitedMatrix:
         return bool(changed)
 
     def _take(self, K: PETSc.Mat) -> None:
-        """Take the values of K (collective)."""
+        """Copy the values of K (collective)."""
         if self._K.mat == K:
-            # an assembly may have put them elsewhere
+            # an assembly may have reallocated them
             self._K = Entries.within(K)
         else:
             K.copy(self._K.mat, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self._state, self._changed = K.stateGet(), None
 
     def _places_beyond(self) -> Blocks:
-        """Blocks of K in owned rows and other ranks' columns; as values, where they begin and how many entries their lines have."""
+        """Blocks of K in owned rows and other ranks' columns, with their positions and the lengths of their lines as values."""
         g, n = self.space.block, self.space.n_owned
         lines = np.arange(n, n + n if self.space.comm.size > 1 else n)
         places, i, width = blocks_of(lines, self._K.indptr, g)
@@ -238,9 +238,9 @@ class UnitedMatrix:
     def _make_places(
         self, begins: bool, changes: Blocks, there: Bools | None, P: Restriction, Q: Restriction, G: Blocks | None
     ) -> None:
-        """Make the matrix anew where it lacks places, or has those of earlier steps when a step begins (collective).
+        """Make the matrix anew if it lacks blocks, or if it has blocks of earlier steps when a step begins (collective).
 
-        ``there (k,)`` tells of the changes, if known, whether K has them.
+        ``there (k,)`` is the mask of changes that K has, if known.
         """
         comm = self.space.comm
         wanted = self._missing(changes, there)
@@ -261,7 +261,7 @@ class UnitedMatrix:
         self._create()
 
     def _missing(self, blocks: Blocks, there: Bools | None = None) -> Ints:
-        """Keys of those blocks that K lacks, of which ``there (k,)`` it has, if known."""
+        """Keys of the blocks that K does not have; ``there (k,)`` is the mask of blocks that it has, if known."""
         there = self._find(self._K, blocks)[1] if there is None else there
         new = blocks.some(~there)
         first = self.space.first
@@ -269,7 +269,7 @@ class UnitedMatrix:
         return np.unique(line * self._size + new.column)
 
     def _create(self) -> None:
-        """Make the matrix, with the entries of K and those that were filled (collective)."""
+        """Make the matrix, with the entries of K and the additional blocks (collective)."""
         K, g = self._K, self.space.block
         # lines of nodes, each of g lines of components with the same columns
         line, column = np.divmod(self._filled, self._size)
@@ -286,11 +286,11 @@ class UnitedMatrix:
         there = np.empty((len(order), g), K.indptr.dtype)
         there[order] = _lines(starts[g * lines] + g * before, widths[lines], g)
         all_columns[_along(there[order], g)] = (g * sorted_columns[:, None] + np.arange(g, dtype=K.columns.dtype))[:, None]
-        #: Lines of blocks where others are new: those of K, and where they went to.
+        #: Lines of K's blocks in lines with additional blocks: positions in K and in the matrix.
         self._moved = _lines(places, width, g), there[: len(places)]
-        #: Lines of blocks that K lacks.
+        #: Lines of the additional blocks.
         self._empty = there[len(places) :]
-        #: Where the lines between those that have grown went to, and where they come from.
+        #: Contiguous pieces between lines with additional blocks: in the matrix and in K.
         self._runs = []
         begins, ends = np.append(0, g * (grown + 1)), np.append(g * grown, len(K.indptr) - 1)
         for a, b, c in zip(K.indptr[begins], K.indptr[ends], starts[begins]):
@@ -300,15 +300,15 @@ class UnitedMatrix:
             all_columns[to] = K.columns[here]
         self._A, self._changed = Entries.of_arrays(starts, all_columns, values, K.mat), None
         held = np.flatnonzero(~self._made_for[1])
-        #: Places of prescribed components' diagonal, in K and in the matrix.
+        #: Positions of the diagonal entries of prescribed components, in K and in the matrix.
         self._held = tuple(entries.find(held, held + self._first)[0] for entries in (K, self._A))
 
 
 def _lines(places: Ints, width: Ints, g: int) -> Ints:
-    """Places of the lines of blocks ``(k, g)``, from those of the first and the number of entries in each line ``(k,)``."""
+    """Positions of the lines of blocks ``(k, g)``, from the first line's position and the number of entries per line ``(k,)``."""
     return places[:, None] + width[:, None] * np.arange(g, dtype=width.dtype)
 
 
 def _along(lines: Ints, g: int) -> Ints:
-    """Places of the entries of blocks ``(k, g, g)`` from those of their lines ``(k, g)``."""
+    """Positions of the entries of blocks ``(k, g, g)`` from the positions of their lines ``(k, g)``."""
     return lines[:, :, None] + np.arange(g, dtype=lines.dtype)

@@ -209,12 +209,12 @@ class AddedMass:
 
     @property
     def kinetic_energy(self) -> float:
-        """Kinetic energy, that of rotation included."""
+        """Kinetic energy, including rotation."""
         return 0.5 * float(self.masses @ (self.velocity**2).sum(axis=1))
 
 
 def principal(inertia: Array, gdim: int) -> tuple[Array, Array]:
-    """Second moments J ``(n_axes,)`` of an inertia ``(n_turns, n_turns)``, and axes ``(n_axes, gdim)``; none without any."""
+    """Second moments J ``(n_axes,)`` of an inertia ``(n_turns, n_turns)``, and axes ``(n_axes, gdim)``; empty for zero inertia."""
     if not inertia.any():
         return np.zeros(0), np.zeros((0, gdim))
     if gdim == 2:
@@ -224,7 +224,7 @@ def principal(inertia: Array, gdim: int) -> tuple[Array, Array]:
 
 
 def add_masses(couplings: Sequence[RigidCoupling], dynamics: Any) -> None:
-    """Give couplings, which are attached, what they add, and the dynamics of a problem these (collective)."""
+    """Make the added masses of attached couplings, and add them to the dynamics of a problem (collective)."""
     for one in couplings:
         if one.mass or one.inertia.any():
             one.added = AddedMass(one)

@@ -22,15 +22,15 @@ class Record:
     """One committed step: a value.
 
     Attributes:
-        before: what the step began with.
-        displacement: it ended with ``(n_local incl. ghosts,)``.
-        states: of the pairs in equilibrium, before they were committed.
+        before: initial state of the step.
+        displacement: at its end ``(n_local incl. ghosts,)``.
+        states: of the pairs in equilibrium, before their commit.
         motions: of the pairs' rigid targets.
-        values: of what the residual is made of.
-        friction, offsets: of the pairs' contactors ``(n,)`` each; None without.
-        shares: that it has of values that its load leads Constants to, by the ids of these.
-        held: of Dirichlet values, ghosts included ``(n,)``, or of all.
-        dt: length of a step in time; 0 in statics.
+        values: of Constants and Functions in the residual.
+        friction, offsets: of the pairs' contactors ``(n,)`` each, or None.
+        shares: of Constants and offsets, see ``solve.taken``, by their ids.
+        held: shares of Dirichlet values, ghosts included ``(n,)``, or one share of all.
+        dt: length of a time step; 0 in statics.
     """
 
     before: Memory
@@ -46,18 +46,18 @@ class Record:
 
 
 class Records:
-    """Records of steps in their order; values that have not changed since the step before are kept once.
+    """Records of steps in their order; values that have not changed since the previous step are stored once.
 
     Args:
-        folder: where each rank has a scratch file, which goes with this object; None keeps all in memory.
+        folder: for a scratch file of each rank, which is deleted with this object; None keeps all records in memory.
 
     Raises:
-        OSError: if there is no such folder, or it cannot be written in.
+        OSError: if the folder does not exist or is not writable.
     """
 
     def __init__(self, folder: Path | None = None):
         self._file: Any = None if folder is None else tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
-        #: Of every step what is kept of it, and of its values one by one.
+        #: Stored record of every step, and its stored values one by one.
         self._steps: list[tuple[Any, list[Any]]] = []
         #: Values of the last step.
         self._last: list[Array] = []
@@ -66,7 +66,7 @@ class Records:
         return len(self._steps)
 
     def __getitem__(self, k: int) -> Record:
-        """A record, read from the file where there is one."""
+        """A record, read from the file if there is one."""
         record, values = self._steps[k]
         found: Record = self._get(record)
         return replace(found, values=[self._get(value) for value in values])
@@ -75,13 +75,13 @@ class Records:
         return (self[k] for k in range(len(self)))
 
     def cut(self, n: int) -> None:
-        """Forget all steps but the first n."""
+        """Remove all steps except the first n."""
         if n < len(self):
             del self._steps[n:]
             self._last = self[n - 1].values if n else []
 
     def add(self, record: Record) -> None:
-        """Keep a further step."""
+        """Append a step."""
         kept = self._steps[-1][1] if self._steps else []
         same = [np.array_equal(a, b) for a, b in zip(self._last, record.values)] or [False] * len(record.values)
         values = [kept[k] if same[k] else self._keep(value) for k, value in enumerate(record.values)]
@@ -89,7 +89,7 @@ class Records:
         self._steps.append((self._keep(replace(record, values=[])), values))
 
     def _keep(self, what: Any) -> Any:
-        """What ``_get`` gives back: itself, or its place in the file."""
+        """Store an object for ``_get``; returns the object, or its position in the file."""
         if self._file is None:
             return what
         place = self._file.seek(0, 2)

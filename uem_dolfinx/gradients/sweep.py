@@ -1,15 +1,15 @@
-"""A sweep over recorded steps, from the last to the first: each linearised where it ended, with one adjoint problem.
+"""A backward sweep over recorded steps, each linearised at its end, with one adjoint problem per step.
 
-With displacements u_n, memories h_n that a step leaves behind, and a residual R of a step that began with h_{n-1},
+With displacements u_n, history variables h_n at the end of a step, and the residual R of a step that begins with h_{n-1},
 
     R(u_n, h_{n-1}; m) = 0,        h_n = H(u_n, h_{n-1})
 
-derivatives are handed back,
+derivatives are computed backwards,
 
     d_n = dJ/du_n + (dH/du_n)' b_n,        b_{n-1} = (dH/dh_{n-1})' b_n + dJ/dh_{n-1} through a_n
 
-where a_n is of the adjoint problem with the load d_n, as in ``adjoint``. Memories are anchors of contactors with friction, velocities and
-accelerations, and the histories of laws.
+where a_n is the solution of the adjoint problem with the load d_n, as in ``adjoint``. History variables are anchors of contactors with
+friction, velocities and accelerations, and the histories of laws.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from uem_dolfinx.solve.united.system import BodySystem
 
 
 class Sweep:
-    """Adds up derivatives by controls over steps, which are handed to it from the last to the first.
+    """Sums derivatives by controls over steps, from the last to the first.
 
     Args:
         problem: of the steps.
-        controls: what there are derivatives by.
+        controls: of the derivatives.
 
     Attributes:
         found: derivatives by the controls so far; None before the first step.
@@ -63,7 +63,7 @@ class Sweep:
         self._laws = [law.slopes(self._derivatives.a, self._derivatives.test) for law in laws]
 
     def pass_back(self, record: Record, J: ufl.Form | None) -> None:
-        """Go back over a step, at whose end the problem has been placed, with a functional of that end (collective)."""
+        """Process a step, with the problem set to its end, and a functional of its end or None (collective)."""
         step = LinearisedStep(self.problem, record, self._derivatives, self._rates)
         with step:
             handed, self._by_anchors = step.handed_back(self._by_anchors)
@@ -88,7 +88,7 @@ class Sweep:
                 self._pass_back_law(law, adjoint)
 
     def _pass_back_law(self, law: PlasticSlopes, adjoint: Adjoint) -> None:
-        """Take derivatives by the history that a law began the step with, and by its parameters (collective)."""
+        """Compute derivatives by a law's history at the beginning of the step, and by its parameters (collective)."""
         by, by_bulk = law.pass_back(), None
         for k, m in enumerate(self._controls):
             if isinstance(m, fem.Constant | fem.Function) and law.is_made_of(m):
@@ -96,7 +96,7 @@ class Sweep:
                 self._add(k, law.by_parameter(m, by, by_bulk))
 
     def _begin_rates(self, rates: RateSlopes, J: ufl.Form | None) -> None:
-        """Take the slopes of the step, and the velocity and acceleration of its end, with what a functional makes of them (collective)."""
+        """Begin the step's derivatives in time, with a functional of the velocity and acceleration at its end (collective)."""
         dynamics = self.problem.dynamics
         assert dynamics is not None
         rates.begin()
@@ -108,7 +108,7 @@ class Sweep:
             rates.look_at(*(0.0 * values if one is None else one for one in by))
 
     def _add_density(self, by: Callable[[Array], float], a: Array) -> None:
-        """Add to the derivative by the density what a tells by its logarithm (collective)."""
+        """Add to the derivative by the density, from the adjoint displacement a and the derivative by its logarithm (collective)."""
         dynamics = self.problem.dynamics
         for k, m in enumerate(self._controls):
             if isinstance(m, fem.Constant) and dynamics is not None and m is dynamics.mass.density:
@@ -124,7 +124,7 @@ class Sweep:
             self.found[k] = self.found[k] + more
 
     def begin(self, first: Record) -> None:
-        """Add derivatives by the anchors that the first step began with, the positions of contactors before it (collective)."""
+        """Add derivatives by the initial anchors of the first step, the positions of contactors before it (collective)."""
         problem = self.problem
         if not any(pair.frictional for pair in problem.pairs):
             return
@@ -138,9 +138,9 @@ class Sweep:
                 self.found[k].x.scatter_forward()
 
     def accelerate(self, start: Record) -> None:
-        """Add derivatives by the first acceleration and velocity, where the problem has been placed (collective).
+        """Add derivatives by the first acceleration and velocity, with the problem set to the start (collective).
 
-        With ``a = -P (P'MP)^-1 P'F`` under the forces F at the start, functionals that count it by b do so by ``P (P'MP)^-1 P'b`` times -F.
+        With ``a = -P (P'MP)^-1 P'F`` under the initial forces F, a functional with derivative b by a has ``-P (P'MP)^-1 P'b`` by F.
         """
         problem, dynamics, system = self.problem, self.problem.dynamics, self.problem.system
         if dynamics is None or self._rates is None:
@@ -165,7 +165,7 @@ class Sweep:
         self._add_density(self._rates.by_density_at_start, a.array_r[: by_velocity.size])
 
     def _refuse_turns(self) -> None:
-        """Refuse rigid targets as controls where contactors that touch at the start tell accelerations (collective)."""
+        """Refuse parameters of rigid targets if contactors touch at the start, and so affect the first acceleration (collective)."""
         for m in self._controls:
             moves = isinstance(m, ContactParameter) and m.parameter in ("place", "turn")
             if moves and reduced(self.problem.comm, int(m.contact.pair.trial.active.sum())):
@@ -176,13 +176,13 @@ class Sweep:
 
 
 class LinearisedStep(Linearised):
-    """The united problem linearised at the end of a recorded step, where it has been placed (collective).
+    """The constrained problem linearised at the end of a recorded step (collective).
 
     Args:
-        problem: as the step left it before it was committed.
+        problem: set to the end of the step, before its commit.
         record: of the step.
         derivatives: of its residual and of functionals.
-        rates: slopes of the step in time; None in statics.
+        rates: derivatives of the time step; None in statics.
     """
 
     def __init__(self, problem: UnitedProblem, record: Record, derivatives: Derivatives, rates: RateSlopes | None):
@@ -193,7 +193,7 @@ class LinearisedStep(Linearised):
         self.damped: Array | float = 0.0
 
     def share(self, m: Any) -> float:
-        """How much of a change of a control the step has seen."""
+        """Share of a control in the step, see ``solve.taken``."""
         return self._led.get(id(led_for(m)), 1.0)
 
     def _linearise(self) -> None:
@@ -219,7 +219,7 @@ class LinearisedStep(Linearised):
             self.problem.system.forget()
 
     def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
-        """As that of ``Linearised``, with all that friction adds (collective)."""
+        """As in ``Linearised``, with the terms of friction (collective)."""
         pairs, slopes = [self.problem.pairs[k] for k in which], [self._slopes[k] for k in which]
         states, like = [pair.trial for pair in pairs], self.config.unknowns.vector()
         for pair, own in zip(pairs, slopes):
@@ -253,11 +253,11 @@ class LinearisedStep(Linearised):
         return forms.product(self._K_back, a)
 
     def handed_back(self, by_anchors: list[Array]) -> tuple[Any, list[Array]]:
-        """Derivatives by anchors at the step's end as those by its places, and by the anchors that stay (collective)."""
+        """Derivatives by final positions, from derivatives by final anchors, and by the anchors that are unchanged (collective)."""
         return _back(self.problem, by_anchors, self._slopes)
 
     def by_anchors(self, adjoint: Adjoint, kept: list[Array]) -> list[Array]:
-        """Derivatives by the anchors that the step began with, those of anchors that stay among them (collective)."""
+        """Derivatives by the initial anchors of the step, including unchanged anchors (collective)."""
         n, g = self.config.n_owned, self.config.gdim
         a, first, found = adjoint.a.x.array[: n * g].reshape(n, g), 0, []
         for slopes, own, before in zip(self._slopes, self.equations, kept):
@@ -268,7 +268,7 @@ class LinearisedStep(Linearised):
 
 
 def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) -> Array | float:
-    """Derivative of the work of damping along ``a``, which ``derivatives`` take, by the velocity ``(n,)``; 0 without (collective)."""
+    """Derivative of the work of damping along ``a`` by the velocity ``(n,)``; 0 without damping (collective)."""
     derivatives.along(problem.config.from_rows(a.array_r))
     if problem.dynamics is None or problem.dynamics.damping is None:
         return 0.0
@@ -279,7 +279,7 @@ def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) ->
 def _back(
     problem: UnitedProblem, by_anchors: list[Array], slopes: Sequence[AnchorSlopes | None] | None = None
 ) -> tuple[Array, list[Array]]:
-    """Derivatives by anchors as those by places of the owned nodes ``(n_owned, gdim)``, and by the anchors that stay (collective)."""
+    """Derivatives by positions of the owned nodes ``(n_owned, gdim)``, from derivatives by anchors, and by unchanged ones (collective)."""
     first = slopes is None
     if slopes is None:
         slopes = [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(problem.pairs, problem.contacts)]
@@ -293,7 +293,7 @@ def _back(
 
 
 def _left_behind(problem: UnitedProblem, m: ContactParameter, handed: Array) -> Array:
-    """What derivatives by places of contactors are by a motion of their target, which leaves these behind (collective)."""
+    """Derivatives by a motion of the target, from derivatives ``handed`` by positions of contactors relative to it (collective)."""
     found = np.zeros(m.shape(problem.config.gdim))
     for entry in np.ndindex(found.shape) if m.parameter in ("place", "turn") else ():
         found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()

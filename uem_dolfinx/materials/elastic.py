@@ -27,17 +27,17 @@ POISSON = given.between(-1.0, 0.5, "a body that hardly changes its volume has 0.
 
 @dataclass(frozen=True)
 class Elastic(ABC):
-    """Common part of the elastic laws.
+    """Base of the elastic laws.
 
     Attributes:
         E: Young's modulus, a force per area: a number, a Constant, a Function or any UFL expression.
-        nu: Poisson's ratio, likewise.
-        kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh that has been declared so: strains and
-            stresses are ``(3, 3)`` then, in the order r, z and around the axis.
+        nu: Poisson's ratio, of the same types.
+        kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh declared axisymmetric: strains and
+            stresses are then ``(3, 3)``, in the order r, z and circumferential.
 
     Raises:
-        InputError, InputTypeError: for an unknown kind, E that is not positive and finite, or nu that is not between -1 and 1/2. Values
-            of Constants and Functions are looked at here and now; a Function that is still zero is taken to be filled later.
+        InputError, InputTypeError: for an unknown kind, E that is not positive and finite, or nu that is not between -1 and 1/2. Present
+            values of Constants and Functions are checked, except Functions that are zero, which may be filled later.
     """
 
     E: Any
@@ -61,7 +61,7 @@ class Elastic(ABC):
 
     @property
     def lam_in_plane(self) -> Any:
-        """The same with the strain across a stress-free plane eliminated, where the law is linear in its strain."""
+        """Lame's first constant, in plane stress with the out-of-plane strain eliminated, for laws that are linear in their strain."""
         return 2 * self.mu * self.lam / (self.lam + 2 * self.mu) if self.kind == "plane_stress" else self.lam
 
     def _check(self, u: Any) -> Any:
@@ -71,7 +71,7 @@ class Elastic(ABC):
 
     @abstractmethod
     def _energies(self, u: Any) -> tuple[Expr, Expr]:
-        """Stored energy per reference volume in two parts: that of mu, and that of lambda, which resists changes of volume."""
+        """Stored energy per reference volume in two parts: of mu, and of lambda, which resists changes of volume."""
 
     @abstractmethod
     def _stresses(self, u: Any) -> tuple[Expr, Expr]:
@@ -87,7 +87,7 @@ class Elastic(ABC):
         return sum(self._stresses(u))
 
     def first_piola(self, u: Any) -> Expr:
-        """Stress that does work on ``grad(v)``: ``F S``."""
+        """First Piola-Kirchhoff stress ``F S``, conjugate to ``grad(v)``."""
         return self._first_piola(u, self.stress(u))
 
     def _first_piola(self, u: Any, stress: Any) -> Expr:
@@ -98,12 +98,12 @@ class Elastic(ABC):
         return ufl.inner(self.first_piola(u), displacement_gradient(v))
 
     def residual_form(self, u: fem.Function, v: Any, dx: ufl.Measure = ufl.dx) -> ufl.Form:
-        """Internal virtual work of bodies that hardly change their volume, whose cells do not lock as nu approaches 1/2.
+        """Internal virtual work of nearly incompressible bodies, without locking as nu approaches 1/2.
 
-        What resists changes of volume is integrated with so few points that a cell can follow: one in quadrilaterals, hexahedra of
-        degree 1 and simplices of degree 2, two in each direction in those of degree 2 (selective reduced integration; in
-        quadrilaterals of small strains it is the mean dilatation) [Malkus and Hughes, Computer Methods in Applied Mechanics and
-        Engineering 15 (1978) 63-81].
+        The volumetric part is integrated with fewer points: one in quadrilaterals and hexahedra of degree 1 and simplices of degree 2,
+        two in each direction in quadrilaterals and hexahedra of degree 2 (selective reduced integration; for quadrilaterals and small
+        strains equal to the mean dilatation method) [Malkus and Hughes, Computer Methods in Applied Mechanics and Engineering 15 (1978)
+        63-81].
 
         Args:
             u: displacement.
@@ -111,23 +111,23 @@ class Elastic(ABC):
             dx: measure of the body's cells.
 
         Raises:
-            InputError: for simplices of degree 1, which lock with one point, and axisymmetric cells of degree 1, where one is not enough.
+            InputError: for simplices of degree 1, which lock with one point, and axisymmetric cells of degree 1, which need more points.
         """
         shear, volume = (ufl.inner(self._first_piola(u, part), displacement_gradient(v)) for part in self._stresses(u))
         return self._integrated(shear, volume, u, dx)
 
     def energy_form(self, u: fem.Function, dx: ufl.Measure = ufl.dx) -> ufl.Form:
-        """Stored energy, integrated as in ``residual_form``, which is its derivative."""
+        """Stored energy, integrated as in ``residual_form``, whose form is its derivative."""
         self._check(u)
         return self._integrated(*self._energies(u), u, dx)
 
     def _integrated(self, shear: Expr, volume: Expr, u: fem.Function, dx: ufl.Measure) -> ufl.Form:
-        """Integral of two parts of a stress or an energy, the second of which is zero where nu is, and has no integral then."""
+        """Integral of two parts of a stress or an energy; the second vanishes for nu = 0, and is then not integrated."""
         fewer = self._fewer_points(u, dx)
         return shear * dx if isinstance(volume, Zero) else shear * dx + volume * fewer
 
     def _fewer_points(self, u: fem.Function, dx: ufl.Measure) -> ufl.Measure:
-        """Measure of the changes of volume; across a stress-free plane they are free."""
+        """Measure of the volumetric part; plane stress needs no reduced integration."""
         if self.kind == "plane_stress":
             return dx
         V = given.kind("u", u, isinstance(u, fem.Function), "the displacement, whose degree tells the points").function_space
@@ -194,7 +194,7 @@ class NeoHooke(Elastic):
     """
 
     def _volume_change(self, u: Any) -> Any:
-        """``J^2 - 1``, from the strain itself, so that small strains are not lost in rounding."""
+        """``J^2 - 1``, computed from the strain, so that small strains are not lost in rounding."""
         E = green_lagrange(u)
         second = (ufl.tr(E) ** 2 - ufl.inner(E, E)) / 2
         change = 2 * ufl.tr(E) + 4 * second + (8 * ufl.det(E) if E.ufl_shape == (3, 3) else 0)
@@ -215,10 +215,10 @@ class NeoHooke(Elastic):
 
 
 def check_parameter(what: str, value: Any, within: given.Range) -> None:
-    """Refuse a material parameter out of its range: a number, or values that a Constant or Function has now (collective for Functions).
+    """Refuse a material parameter out of its range: a number, or present values of a Constant or Function (collective for Functions).
 
     Raises:
-        InputTypeError, InputError: naming it and the first bad value.
+        InputTypeError, InputError: with its name and the first invalid value.
     """
     if isinstance(value, Expr):
         given.kind(what, value, value.ufl_shape == (), "a scalar expression", "take a component, or make a scalar Function")
@@ -240,7 +240,7 @@ def green_lagrange(u: Any) -> Expr:
 
 
 def check_kind(kind: str, u: Any) -> None:
-    """Refuse a kind that does not fit a displacement, by its number of components and by whether its mesh is axisymmetric.
+    """Refuse a kind that does not fit the number of components of a displacement, or the axisymmetry of its mesh.
 
     Raises:
         InputError: with the kinds that fit.
@@ -255,23 +255,23 @@ def check_kind(kind: str, u: Any) -> None:
 
 
 def material_of(f: Any) -> Any:
-    """The law with history that a Function is a field of, its reference if the law is gone; None if it is a field of none."""
+    """The law with history that a Function belongs to, the weak reference if the law no longer exists, or None."""
     law = getattr(f, "material", None)
     return law if law is None else law() or law
 
 
 class HistoryMaterial(Protocol):
-    """What the solver needs of a law whose stress is no expression of the displacement alone, as in plasticity.
+    """Interface of the solver to a law whose stress depends on history, not only on the displacement, e.g. plasticity.
 
-    The Functions that its forms hold may refer to it, weakly, by an attribute ``material``, and it to its displacement by ``u``. Of a
-    mixed space it tells the displacement's part as ``displacement``; ``stiffness`` gets trial and test functions of the whole space.
+    Functions in its forms may refer to it weakly by an attribute ``material``, and the law to its displacement by ``u``. In a mixed
+    space ``displacement`` is the number of the displacement's part; ``stiffness`` gets trial and test functions of the whole space.
     """
 
     #: Committed Functions that the stress depends on, by name.
     history: dict[str, Any]
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
-        """What the derivative of the residual lacks: the stress's change with the displacement."""
+        """Part of the tangent that is missing in the derivative of the residual form: the stress's change with the displacement."""
 
     def update(self) -> None:
         """Stresses at the present displacement, from the committed history."""
@@ -287,5 +287,5 @@ class HistoryMaterial(Protocol):
 
 
 def is_history_material(material: object) -> bool:
-    """Whether this is a law with history, and not one whose stress is an expression of the displacement alone."""
+    """Whether an object is a law with history, with the interface of ``HistoryMaterial``."""
     return all(hasattr(material, name) for name in ("history", "stiffness", "update", "commit"))

@@ -1,4 +1,4 @@
-"""Pictures of scenes, of pressure profiles and of whatever else is drawn into their panels, gathered to rank 0 for drawing alone."""
+"""Pictures of scenes, setups and pressure profiles, with panels for further plots; data are gathered to rank 0 for drawing only."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 class Picture:
-    """A picture in memory: Jupyter shows it where it is the value of a cell.
+    """A picture in memory: Jupyter shows it if it is the value of a cell.
 
     Attributes:
-        png: its bytes; none where rank is not 0.
+        png: its bytes; empty on ranks other than 0.
     """
 
     def __init__(self, png: bytes):
@@ -64,20 +64,20 @@ def _check_ending(path: str | Path, known: Sequence[str]) -> None:
 def figure(
     path: str | Path | BinaryIO | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8), dpi: float = 150
 ) -> Iterator[list[Any]]:
-    """Canvas with panels side by side, saved at the end; the backend of matplotlib stays as it is (collective).
+    """Canvas with panels side by side, saved at the end; the backend of matplotlib is not changed (collective).
 
     Args:
-        path: name of the picture, whose folder is made, or a file that is open. None draws nothing.
-        comm: communicator; rank 0 draws, and to it alone everything is gathered.
+        path: name of the picture, whose folder is made, or an open file. None draws nothing.
+        comm: communicator; data are gathered to rank 0, which draws.
         panels: number of panels.
         size: width and height of a panel in inches.
-        dpi: points of the picture per inch; ``.pdf`` and ``.svg`` have lines instead, but for images of 3D scenes.
+        dpi: points of the picture per inch; ``.pdf`` and ``.svg`` have vector graphics instead, except for images of 3D scenes.
 
     Yields:
-        The panels: matplotlib Axes on rank 0, None elsewhere. Hand them to :func:`plot_scene` and :func:`plot_pressure`.
+        The panels: matplotlib Axes on rank 0, None elsewhere. Pass them to :func:`plot_scene` and :func:`plot_pressure`.
 
     Raises:
-        InputError, InputTypeError: for an argument out of its range, or a name whose ending is no format of matplotlib's.
+        InputError, InputTypeError: for an argument out of its range, or a name whose ending is no format of matplotlib.
         MissingBackendError: if matplotlib cannot be imported.
         OutputError: if the picture cannot be written.
         Exception: any error of drawing on rank 0, on all ranks.
@@ -108,7 +108,7 @@ def figure(
 def _panel(
     picture: str | Path | BinaryIO | Any, comm: MPI.Comm, size: tuple[float, float] = (6.4, 4.8), dpi: float = 150
 ) -> Iterator[Any]:
-    """The panel that is given, or the one of a picture of this name; what is raised in drawing is raised on all ranks (collective)."""
+    """A given panel, or the panel of a new picture of this name; errors in drawing are raised on all ranks (collective)."""
     if isinstance(picture, (str, Path, BytesIO)):
         with figure(picture, comm, size=size, dpi=dpi) as (panel,):
             yield panel
@@ -138,39 +138,39 @@ def plot_scene(
     size: tuple[float, float] = (6.4, 4.8),
     dpi: float = 150,
 ) -> Picture | None:
-    """Draw a scene where it is now, coloured by a field: the cells of a 2D scene, the outside of a 3D one (collective).
+    """Draw the deformed bodies, coloured by a field: the cells in 2D, the surface in 3D (collective).
 
     Args:
-        problem: the scene.
-        picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0). Left out, the picture is returned, and
+        problem: the problem.
+        picture: name of the picture, or a panel of :func:`figure` (None on ranks other than 0). By default the picture is returned, and
             Jupyter shows it.
         field: scalar UFL expression, averaged at the nodes of each body; a scalar Lagrange Function, drawn with its values at the
-            vertices; a contact or a list of them, for their pressure, grey where there is none; None is the size of the displacement.
+            vertices; a contact or a list of contacts, for their pressure, grey elsewhere; None is the magnitude of the displacement.
         label: of the colour bar.
         levels: number of colours, or their bounds.
         scale: magnification of the displacement.
-        window: ``(x_min, x_max, y_min, y_max)`` to show, in 3D with ``z_min, z_max``, where bodies are cut open and the field is drawn
+        window: visible part ``(x_min, x_max, y_min, y_max)``, in 3D with ``z_min, z_max``, where bodies are cut and the field is drawn
             on the sections; None shows everything.
         mirror: draw the reflection at ``x = 0`` too, for half models; 2D only.
         cells: draw the edges of the cells.
-        arrows: draw the contact forces per tributary area, on the contactors; the default in 2D. In 3D they are seen with the contactor
-            alone, as ``surface``.
+        arrows: draw the contact forces per tributary area, on the contactors; the default in 2D. In 3D they are visible if only the
+            contactor is drawn, by ``surface``.
         cmap: colour map.
         view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
-        surface: facets that are drawn alone, such as a contactor that bodies hide: a tag, or any surface of a contact; 3D only.
-        percentiles: two of the values shown between which the colours lie, such as ``(1, 99)``, so that a few large values, as at
-            corners, do not take them all; None takes all values.
+        surface: draw only these facets, such as a contactor hidden by bodies: a tag, or any surface of a contact; 3D only.
+        percentiles: percentiles of the visible values for the range of colours, such as ``(1, 99)``, so that a few large values, e.g.
+            at corners, do not dominate; None uses all values.
         rigid: draw rigid targets.
         triad: draw the axes in a corner; 3D only.
-        size: width and height in inches; of a panel it is that of :func:`figure`.
-        dpi: points per inch; of a panel it is that of :func:`figure`.
+        size: width and height in inches; ignored for a panel of :func:`figure`.
+        dpi: points per inch; ignored for a panel of :func:`figure`.
 
     Returns:
         The picture if it has neither name nor panel.
 
     Raises:
         MissingBackendError: if matplotlib cannot be imported, or in 3D PyVista.
-        InputError, InputTypeError: for an argument that is none in this dimension, or out of its range.
+        InputError, InputTypeError: for an argument that does not exist in this dimension, or out of its range.
     """
     drawing = Drawing(
         problem, field=field, label=label, levels=levels, scale=scale, window=window, mirror=mirror, cells=cells, arrows=arrows,
@@ -200,36 +200,35 @@ def plot_setup(
     size: tuple[float, float] = (6.4, 4.8),
     dpi: float = 150,
 ) -> Picture | None:
-    """Draw what a problem declares: undeformed bodies, supports, prescribed motions, loads, contactors and targets (collective).
+    """Draw the setup of a problem: undeformed bodies, supports, prescribed motions, loads, contactors and targets (collective).
 
-    Each body has its grey. Contactors and targets have colours of their own, with their names; rigid targets are hatched, in 3D
-    seen through. Supports in all components are hatched, in 3D dark; a triangle, in 3D a cone, is a support along one component,
-    drawn from outside. Arrows are prescribed displacements, motions of rigid surfaces, loads on surfaces and points, forces on
-    bodies, gravity and the velocity at the start; the length of arrows of displacements and velocities is their size, the others
-    show directions only.
+    Bodies have different greys. Contactors and targets are coloured and named; rigid targets are hatched, in 3D transparent. Supports
+    in all components are hatched, in 3D dark; a triangle, in 3D a cone, is a support along one component, drawn from outside. Arrows
+    are prescribed displacements, motions of rigid surfaces, loads on surfaces and points, forces on bodies, gravity and the initial
+    velocity. Arrows of displacements, velocities and forces on bodies are scaled by magnitude, other arrows show directions only.
 
     Args:
-        problem: the scene.
-        picture: name of the picture, or a panel of :func:`figure` (None where rank is not 0). Left out, the picture is returned, and
+        problem: the problem.
+        picture: name of the picture, or a panel of :func:`figure` (None on ranks other than 0). By default the picture is returned, and
             Jupyter shows it.
         at: load factor or time whose loads, Dirichlet values and rigid surfaces are drawn, as the problem's ``load`` sets them; the
             present values are restored. None is the full load in statics, and the present time in dynamics.
         loads: find the loads in the residual: it is assembled at zero displacement, surface integrals separately.
         arrows: further arrows, such as values that are prescribed later: positions, directions ``(gdim,)`` and names.
         cells: draw the edges of the cells.
-        window: as of :func:`plot_scene`; nothing is cut.
+        window: as in :func:`plot_scene`; bodies are not cut.
         view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
         legend: draw a legend.
         triad: draw the axes in a corner; 3D only.
-        size: width and height in inches; of a panel it is that of :func:`figure`.
-        dpi: points per inch; of a panel it is that of :func:`figure`.
+        size: width and height in inches; ignored for a panel of :func:`figure`.
+        dpi: points per inch; ignored for a panel of :func:`figure`.
 
     Returns:
         The picture if it has neither name nor panel.
 
     Raises:
         MissingBackendError: if matplotlib cannot be imported, or in 3D PyVista.
-        InputError, InputTypeError: for an argument that is none in this dimension, or out of its range.
+        InputError, InputTypeError: for an argument that does not exist in this dimension, or out of its range.
         UserFunctionError: if a function in ``load`` raises.
     """
     from uem_dolfinx.output.declared import Declarations
@@ -275,19 +274,19 @@ def plot_pressure(
     window: tuple[float, float] | None = None,
     mirror: bool = False,
 ) -> Picture | None:
-    """Draw the contact pressure at the contactors over a coordinate (collective).
+    """Plot the contact pressure at the contactors over a coordinate (collective).
 
     Args:
         contacts: one contact or several.
-        picture: name of the picture, or a panel of :func:`figure`. Left out, the picture is returned, and Jupyter shows it.
+        picture: name of the picture, or a panel of :func:`figure`. By default the picture is returned, and Jupyter shows it.
         along: coordinate of reference points ``(n, gdim)`` to draw over ``(n,)``; None is x in 2D, and in 3D the distance
             from the axis through the origin, ``sqrt(x^2 + y^2)``.
         reference: exact pressure as a function of that coordinate.
         reference_label: in the legend.
-        contact_label: in the legend; several contacts have their names there. More may be drawn into the same panel.
+        contact_label: in the legend, for a single contact; several contacts are labelled by their names.
         label: of the pressure axis.
         along_label: of the other axis.
-        window: part of the coordinate to show; None shows half as much again as the pressed part.
+        window: visible range of the coordinate; None shows the part with pressure, with a margin.
         mirror: draw the reflection at 0 too, for half models.
 
     Returns:
@@ -295,7 +294,7 @@ def plot_pressure(
 
     Raises:
         MissingBackendError: if matplotlib cannot be imported.
-        InputError, InputTypeError: for no contact, or a function that returns anything else than a number for each point.
+        InputError, InputTypeError: for an object that is no contact, or a function that does not return one number per point.
         UserFunctionError: if a function raises.
     """
     pairs: list[Contact] = given.items("contacts", [contacts] if _is_contact(contacts) else contacts, _is_contact, "a contact")
@@ -323,7 +322,7 @@ def plot_pressure(
                     s, p = np.concatenate([-s, s]), np.concatenate([p, p])
                 ax.plot(s, p, ".", ms=7 if len(p) < 400 else 3, label=contact.name if len(pairs) > 1 else contact_label, zorder=2)
             ax.set(xlim=shown[0], xlabel=along_label or ("x" if gdim == 2 else "r"), ylabel=label)
-            # room above pressures that are all the same
+            # margin above uniform pressures
             ax.set_ylim(0.0, max(ax.get_ylim()[1], 1.05 * max(float(p.max(initial=0.0)) for _, p in curves)))
             ax.grid(alpha=0.25)
             ax.legend(frameon=False)
@@ -335,7 +334,7 @@ def _is_contact(one: Any) -> bool:
 
 
 def _curve(what: str, f: Callable[[Array], Any], at: Array, n: int) -> Array:
-    """What a function of a user's tells of n points, which ``what`` names ``(n,)``; raises as ``plot_pressure``, on this rank."""
+    """Values ``(n,)`` of a function of the user, ``what`` in messages, at n points; raises as ``plot_pressure``, on this rank."""
     found = ask(what, f, at)
     try:
         values = np.asarray(found, dtype=float)

@@ -1,4 +1,4 @@
-"""How a sketch of what a problem declares is drawn into a panel, 2D by matplotlib, 3D by PyVista: bodies grey, all else coloured."""
+"""Drawing of a sketch of a problem's declarations into a panel, 2D by matplotlib, 3D by PyVista; bodies are grey."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from uem_dolfinx.output.acting import Acting
 from uem_dolfinx.output.declared import Declared, Surface
 from uem_dolfinx.output.drawings import EVEN, draw_rigid, draw_triad
 
-#: Greys of bodies, one after the other, and where these are held in all components.
+#: Greys of bodies, in turn, and the colour of surfaces held in all components.
 SHADES, CLAMPED = ("#e9e9e9", "#d3d3d3", "#dedede", "#c8c8c8"), "#303030"
-#: Opacity of these and of rigid surfaces in space.
+#: Opacity of these and of rigid surfaces in 3D.
 THROUGH = {"opacity": 0.55}
 #: Contactors and targets of a contact, of the next one, and so on.
 PAIRS = (
     ("#d62728", "#1f77b4"), ("#ff8c00", "#139b9b"), ("#c2188b", "#27348b"), ("#8c564b", "#7a8b00"), ("#e6ab02", "#5b2a86"),
     ("#ff6f91", "#00695c"),
 )  # fmt: skip
-#: What acts.
+#: Colours of conditions and loads by kind.
 COLOURS = {
     "held": "#303030", "prescribed": "#1a7f37", "value": "#1a7f37", "load": "#a0440a", "body load": "#a0440a", "velocity": "#6a2c91",
     "spring": "#139b9b", "equation": "#c2188b", "turn": "#a0440a", "arm": "#303030", "own": "#000000",
 }  # fmt: skip
-#: What the legend begins with.
+#: First kinds in the legend.
 FIRST = ("surface", "rigid", "clamped", "held", "arrow")
-#: Kinds whose arrows tell sizes, too.
+#: Kinds whose arrows also show sizes.
 SIZED = ("prescribed", "body load", "velocity")
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a sketch looks like.
+    """Options of a sketch.
 
     Attributes:
-        arrows: what else acts: places, directions and names.
+        arrows: further arrows: positions, directions and names.
         cells: draw the edges of the cells.
-        window: bounds of what is shown ``(gdim, 2)``; None is everything.
+        window: bounds of the visible part ``(gdim, 2)``; None shows everything.
         view: direction from the scene to the eye ``(3,)``, in 3D.
-        legend: name what is drawn.
+        legend: draw a legend.
         triad: draw the axes in a corner, in 3D.
         width: of an image of a 3D scene, in points.
     """
@@ -58,15 +58,15 @@ class Look:
 
 
 def thinned(points: Array, spacing: float) -> Ints:
-    """Some of the points ``(n, gdim)`` that are no nearer to each other than a spacing, and near to all others: their numbers ``(k,)``.
+    """Numbers ``(k,)`` of points ``(n, gdim)`` at least a spacing apart, with all other points within this spacing of one of them.
 
-    They are the same in any order of the points.
+    The selection does not depend on the order of the points.
     """
     from scipy.spatial import cKDTree
 
     if not len(points):
         return np.zeros(0, dtype=np.int64)
-    # rounding must not tell their order
+    # rounding must not determine their order
     order = np.lexsort(np.round(points / spacing, 6).T)
     tree, left, found = cKDTree(points), np.ones(len(points), dtype=bool), []
     for i in order:
@@ -77,7 +77,7 @@ def thinned(points: Array, spacing: float) -> Ints:
 
 
 class Sketch:
-    """What is to be drawn of a problem, in 2D or 3D alike."""
+    """Symbols, arrows and names of a sketch, in 2D and 3D."""
 
     def __init__(self, found: Declared, look: Look):
         self.found, self.look = found, look
@@ -87,11 +87,11 @@ class Sketch:
         self.size = float(np.diff(ends, axis=1).max())
         flat = len(ends) == 2
         self.tick, self.unit = (0.025 if flat else 0.032) * self.size, 0.11 * self.size
-        #: How far symbols of one kind are apart, in these lengths.
+        #: Distance between symbols of one kind, in these lengths.
         self.apart = 2.0 if flat else 3.5
-        #: Colours of surfaces: one pair of them for all contacts where there are too many.
+        #: Whether all contacts share one pair of colours, because there are too many.
         self.many = 1 + max((s.pair for s in found.surfaces), default=0) > len(PAIRS)
-        #: Names and colours of what is drawn, and by what kind of symbol.
+        #: Colours of drawn items by kind of symbol and name.
         self.names: dict[tuple[str, str], str] = {}
         self.triangles = list(self._triangles())
         self.arrows = list(self._arrows())
@@ -104,12 +104,12 @@ class Sketch:
             self.box += (0.1 if found.rigid else 0.03) * self.size * np.array([-1.0, 1.0])
 
     def _name(self, kind: str, name: str, colour: str) -> str:
-        """Note what the legend has to name; returns the colour."""
+        """Add an item to the legend; returns the colour."""
         self.names.setdefault((kind, name), colour)
         return colour
 
     def acting(self, *kinds: str) -> Iterator[Acting]:
-        """What acts, of some kinds."""
+        """Conditions and loads of some kinds."""
         return (one for one in self.found.acting if one.kind in kinds)
 
     def colour_of(self, pair: int, side: str) -> str:
@@ -117,13 +117,13 @@ class Sketch:
         return PAIRS[0 if self.many else pair % len(PAIRS)][int(side == "target")]
 
     def name_surface(self, surface: Surface) -> str:
-        """Colour of a surface, which is noted for the legend."""
+        """Colour of a surface, which is added to the legend."""
         count = 1 + max(s.pair for s in self.found.surfaces)
         name = (f"{count} contacts: contactors", "their targets")[int(surface.side == "target")] if self.many else surface.name
         return self._name("surface", name, self.colour_of(surface.pair, surface.side))
 
     def _triangles(self) -> Iterator[tuple[Array, Array]]:
-        """Tips ``(n, gdim)`` of what shows that a component is held, and from where it points there: unit vectors ``(n, gdim)``."""
+        """Symbols of held components: tips ``(n, gdim)``, and unit vectors in which they point ``(n, gdim)``."""
         for one in self.acting("held"):
             for c, axis in enumerate(np.eye(one.at.shape[1])):
                 which = np.flatnonzero(one.vectors[:, c] > 0)
@@ -143,13 +143,13 @@ class Sketch:
         for one in self.acting("prescribed", "load", "body load", "velocity"):
             size = np.linalg.norm(one.vectors, axis=1)
             shown = np.flatnonzero(size > EVEN * size.max())
-            # along a surface they would lie one upon the other
+            # arrows along a surface would overlap
             along = np.abs(np.einsum("ng,ng->n", one.vectors[shown], one.outward[shown])).sum() < 0.5 * size[shown].sum()
             along &= one.outward[shown].any()
             shown = shown[thinned(one.at[shown], (1.3 if along else 0.35 * self.apart) * self.unit)]
             length = size[shown] / largest[one.kind] if one.kind in SIZED and one.name != "gravity" else np.ones(len(shown))
             way = self.unit * (length / size[shown])[:, None] * one.vectors[shown]
-            # what pushes ends at the surface
+            # arrows that push end at the surface
             pushes = np.einsum("ng,ng->n", way, one.outward[shown]) < -EVEN * self.unit
             colour = self._name("arrow", one.name, COLOURS[one.kind])
             yield colour, one.at[shown] - np.where(pushes[:, None], way, 0.0), way
@@ -165,7 +165,7 @@ class Sketch:
             yield self._name("arrow", name, COLOURS["own"]), place[None], way[None]
 
     def legend(self, ax: Any, tall: bool) -> None:
-        """Write the legend beside a picture that is ``tall``, below others."""
+        """Draw the legend to the right of a ``tall`` picture, otherwise below the picture."""
         from matplotlib.lines import Line2D
         from matplotlib.patches import Patch
 
@@ -202,7 +202,7 @@ def draw_2d(ax: Any, found: Declared, look: Look) -> Sketch:
     sketch = Sketch(found, look)
     tick = sketch.tick
     faces = [SHADES[b % len(SHADES)] for b in found.body]
-    # edges of their own colour, between which nothing is seen
+    # edges in the colour of the cells, so that there are no visible gaps
     edge = {"edgecolors": "0.55", "linewidths": 0.25} if look.cells else {"edgecolors": "face", "linewidths": 0.3}
     ax.add_collection(PolyCollection(found.cells, facecolors=faces, zorder=1, **edge))
     ax.add_collection(LineCollection(found.outside, colors="0.25", linewidths=0.8, zorder=1.5))
@@ -235,7 +235,7 @@ def draw_2d(ax: Any, found: Declared, look: Look) -> Sketch:
 
 
 def _draw_clamped(ax: Any, sketch: Sketch) -> None:
-    """Where bodies are held in all components: a line, hatched outside."""
+    """Draw surfaces held in all components: a line, hatched outside."""
     from matplotlib.collections import LineCollection
 
     corners, normals = sketch.found.clamped
@@ -256,7 +256,7 @@ def _draw_clamped(ax: Any, sketch: Sketch) -> None:
 
 
 def _draw_points(ax: Any, sketch: Sketch) -> None:
-    """Nodes of equations, springs, prescribed values, rigid parts with their points, and what turns."""
+    """Draw nodes of equations, springs, prescribed values, rigid parts with their points, and moments or rotations."""
     from matplotlib.collections import LineCollection
 
     for one in sketch.acting("arm"):
@@ -276,7 +276,7 @@ def _draw_points(ax: Any, sketch: Sketch) -> None:
 
 
 def draw_3d(ax: Any, found: Declared, look: Look) -> Sketch:
-    """Draw a scene in space into a panel."""
+    """Draw a 3D scene into a panel."""
     sketch = Sketch(found, look)
     with pictures3d.quiet():
         (image,) = pictures3d.without_margins([_image(sketch)])
@@ -289,7 +289,7 @@ def draw_3d(ax: Any, found: Declared, look: Look) -> Sketch:
 
 
 def _image(sketch: Sketch) -> Array:
-    """The image of a scene in space: bodies are seen through."""
+    """The image of a 3D scene, with transparent bodies."""
     import pyvista
 
     found, look, tick = sketch.found, sketch.look, sketch.tick
@@ -346,7 +346,7 @@ def _image(sketch: Sketch) -> Array:
 
 
 def _soup(corners: Array) -> Any:
-    """PyVista's surface of facets that know nothing of each other ``(m, k, 3)``."""
+    """PyVista's surface of unconnected facets ``(m, k, 3)``."""
     return pictures3d.polygons(corners.reshape(-1, 3), np.arange(corners[..., 0].size).reshape(corners.shape[:2]))
 
 

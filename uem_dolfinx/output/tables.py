@@ -1,4 +1,4 @@
-"""Tables in CSV files: one row per step, complete after every row, and continued where a run is resumed."""
+"""Tables in CSV files: one row per step, complete after every row, and continued if a run is resumed."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from uem_dolfinx.parallel import agreed
 
 
 class Clock(Protocol):
-    """Something that tells how far a run is, in time or in steps, and how often a checkpoint has put it forward."""
+    """Progress of a run, in time or in steps, and the number of checkpoints read."""
 
     @property
     def time(self) -> float:
-        """How far it is."""
+        """Present time, or number of steps."""
 
     @property
     def resumed(self) -> int:
-        """How often a checkpoint was read."""
+        """Number of checkpoints read."""
 
 
 class Closing(ABC):
-    """Base of what is closed at the end of its ``with`` block."""
+    """Base of objects that are closed at the end of their ``with`` block."""
 
     @abstractmethod
     def close(self) -> None:
@@ -49,7 +49,7 @@ _open: WeakValueDictionary[Path, CsvTable] = WeakValueDictionary()
 
 
 def refuse_shared(path: Path, comm: MPI.Comm, whose: str) -> None:
-    """Raise OutputError where a writer of another kind in this run has this file as its table, and is not closed (collective)."""
+    """Raise OutputError if an open writer of another kind in this run has this file as its table (collective)."""
     other = _open.get(path.absolute())
     with agreed(comm):
         if other is not None and not other._closed and other.whose != whose:
@@ -60,25 +60,25 @@ def refuse_shared(path: Path, comm: MPI.Comm, whose: str) -> None:
 
 
 class CsvTable(Closing):
-    """CSV file that rank 0 writes; what goes wrong there is raised on all ranks.
+    """CSV file that rank 0 writes; errors there are raised on all ranks.
 
-    A file that is gone on with stays as it is until the first row is written. A file that a new one would replace is kept in a folder
-    beside it, ``NAME.1`` or the next number, if it has any rows or another run still writes it, which goes on there; so is a copy of
-    one that would lose rows although no checkpoint was read.
+    A resumed file is unchanged until the first row is written. An existing file is moved to a folder ``NAME.1``, or the next number, if
+    it has rows or another run still writes it; that run continues there. A resumed file that would lose rows although no checkpoint was
+    read is copied there first.
 
     Args:
         path: name of the file; its folder is made.
         comm: communicator of the run.
         columns: their names.
-        resume_at: keep the rows of a file that is there up to this value of the column ``key``, and go on after them; of a clock, up
-            to its present time. None begins a new file.
-        key: column that does not fall from row to row, by default the first.
-        words: columns that hold no numbers.
-        whose: the writer that it is of, for messages.
+        resume_at: keep the rows of an existing file up to this value of the column ``key``, or up to the present time of a clock, and
+            append to them. None starts a new file.
+        key: column that does not decrease from row to row, by default the first.
+        words: columns that contain no numbers.
+        whose: the writer of the table in messages.
 
     Raises:
-        OutputError: of rank 0, on all ranks, if the file cannot be written, or another run writes the one to go on with.
-        ValueError, CheckpointError: likewise, if the file to go on with holds what is no number, or has other columns.
+        OutputError: of rank 0, on all ranks, if the file cannot be written, or if another run writes the file to resume.
+        ValueError, CheckpointError: on all ranks, if the file to resume contains invalid numbers, or has other columns.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class CsvTable(Closing):
         self._closed = False
         #: On rank 0.
         self._file: OwnFile | None = None
-        #: Where in the file the rows kept end, and whether later ones follow that would be lost.
+        #: End of the kept rows in the file, and whether later rows follow, which would be lost.
         self._end, self._later = 0, False
         kept = self._on_rank_0(lambda: self._begin(until))
         numbers = [{name: float(value) for name, value in zip(self.columns, row) if value and name not in words} for row in kept]
@@ -115,7 +115,7 @@ class CsvTable(Closing):
         return on_rank_0(self.comm, f"the table {self.path} cannot be written", action)
 
     def _begin(self, until: float | None) -> list[list[str]]:
-        """First and last row of a file to go on with; without one, begin a new file."""
+        """First and last row of a file to resume; without one, start a new file."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if until is not None and self.path.exists():
             self._file = OwnFile(self.path)
@@ -132,7 +132,7 @@ class CsvTable(Closing):
         return []
 
     def _read(self, file: Any, until: float) -> list[list[str]]:
-        """Rows of the file up to a value of the key; finds where they end."""
+        """Rows of the file up to a value of the key; stores their end."""
         kept: list[list[str]] = []
         head, end = file.readline(), 0
         if head.endswith("\n"):
@@ -165,7 +165,7 @@ class CsvTable(Closing):
         self._end += len(data)
 
     def check(self) -> None:
-        """Raise an InputError once closed, a CheckpointError if a checkpoint was read after the table was made to go on with its file."""
+        """Raise an InputError after ``close``, a CheckpointError if a checkpoint was read after the table had been made to resume."""
         if self._closed:
             raise InputError(f"the table {self.path} is closed: write before close(), inside of its with block")
         if self._clock is not None and self._clock.resumed != self._resumed:
@@ -178,8 +178,8 @@ class CsvTable(Closing):
     def write(self, *rows: Sequence[Any]) -> None:
         """Append a row, or several at once; floats are written to the last bit (collective).
 
-        Raises as the table itself, and if it is closed (ValueError) or a checkpoint was read after it had been made to go on with its
-        file, which stays as it was (CheckpointError).
+        Raises as the table itself; also if it is closed (ValueError), or if a checkpoint was read after it had been made to resume its
+        file, which is then unchanged (CheckpointError).
         """
         self.check()
 
@@ -197,7 +197,7 @@ class CsvTable(Closing):
         self._on_rank_0(append)
 
     def close(self) -> None:
-        """Take no more rows."""
+        """Close the file."""
         self._closed = True
         if self._file is not None:
             self._file.close()

@@ -1,4 +1,4 @@
-"""What a checkpoint keeps of a ``UnitedProblem``, and how it is read back into one."""
+"""Contents of a checkpoint of a ``UnitedProblem``, and their restoration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from uem_dolfinx.solve.taken import from_checkpoint, to_checkpoint
 
 
 def state_of(problem: Any) -> State:
-    """Functions and numbers of a problem; read back, its next step is the one that would have come (collective)."""
+    """Functions and numbers of a problem, from which its run continues as if uninterrupted (collective)."""
     stiffness, own, config = fem.Function(problem.config.V), problem.config.functions(), problem.config
     starts = {name: fem.Function(f.function_space) for name, f in own.items()}
     functions = own | {"stiffness": stiffness}
@@ -41,7 +41,7 @@ def state_of(problem: Any) -> State:
     def collect() -> None:
         config.functions()
         known = problem.bodies.to_checkpoint(stiffness)
-        # multigrid learns from one matrix for the next; a run that goes on from the file knows nothing of it
+        # the multigrid hierarchy is rebuilt, as in a run restarted from the file
         problem.system.forget()
         state.numbers |= {"largest forces": np.asarray(problem.largest_forces).tolist(), "stiffness known": known}
         state.numbers |= problem.progress.to_checkpoint(ramped)
@@ -65,7 +65,7 @@ def state_of(problem: Any) -> State:
         if config.unknowns.mixed:
             problem.u.x.array[:] = config.values_of(own)
             for pair in problem.interfaces:
-                # they have been projected where the bodies were before
+                # they were projected at the previous positions of the bodies
                 pair.remember(pair.memory())
                 pair.project()
         problem.committed, problem.motions = np.array(problem.u.x.array), problem.rigid_motions()
@@ -102,6 +102,6 @@ def state_of(problem: Any) -> State:
 
 
 def take_multipliers(problem: Any) -> None:
-    """Give the equations of users the multipliers that a checkpoint has kept by what they eliminate."""
+    """Set the multipliers of users' equations from a checkpoint, by their eliminated components."""
     eq = problem.linear.equations
     problem.linear.multipliers = np.einsum("mg,mg->m", eq.direction, problem.progress.of_equations[eq.node])

@@ -87,7 +87,7 @@ def take_back(problem: Any, at: float) -> None:
 def take_alone(problem: Any, start: Array | None, fraction: float) -> list[Iteration]:
     """Take one step with these arguments of ``UnitedProblem.attempt``, under loads of the factor or the present time (collective).
 
-    Loads stay as they are where the ramp has a start of its own, and where they have been set since the last step.
+    Loads are unchanged if the ramp has a given start, or if they have been set since the last step.
     """
     progress, dynamics = problem.progress, problem.dynamics
     with agreed(problem.comm):
@@ -110,22 +110,22 @@ def take_alone(problem: Any, start: Array | None, fraction: float) -> list[Itera
 
 
 def take_again(problem: Any, before: Memory, led: tuple[Array | None, float, bool]) -> list[Iteration]:
-    """Take the last step of a problem once more, and keep it in its place (collective).
+    """Repeat the last step of a problem, and replace its result (collective).
 
     Args:
         problem: inside a loop over steps.
-        before: what the step began with.
-        led: where the ramp of Dirichlet values began, how far it went, and whether something led the load.
+        before: initial state of the step.
+        led: start and fraction of the ramp of Dirichlet values, and whether the load was controlled, e.g. by arc length.
 
     Raises:
-        UEMError: as of ``UnitedProblem.attempt``, after the step has been put back as it was.
+        UEMError: as in ``UnitedProblem.attempt``, after the previous result has been restored.
     """
     start, fraction, arc = led
     dynamics, now, moved, found = problem.dynamics, Memory.of(problem), problem.rigid_motions(), np.array(problem.u.x.array)
     before.put_back(problem)
     move_targets(problem, moved)
     if arc:
-        # past a limit point the load alone would lead away
+        # beyond a limit point load control would leave the path
         problem.u.x.array[:] = found
     if dynamics is not None:
         dynamics.begin(dynamics.dt)
@@ -138,6 +138,6 @@ def take_again(problem: Any, before: Memory, led: tuple[Array | None, float, boo
         problem.led = led
     problem.keep()
     if dynamics is not None:
-        # which may have been rounded to a multiple of the step
+        # the time may have been rounded to a multiple of the step
         dynamics.time = now.dynamics[0]
     return history

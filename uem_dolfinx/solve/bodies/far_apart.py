@@ -1,7 +1,7 @@
-"""Contacts whose surfaces are so far apart that nothing of them can touch: they are not looked at until they come near.
+"""Contacts whose surfaces are too far from each other to touch: they are not searched until they come near.
 
-Boxes around the surfaces tell, of all contacts together by one reduction. It is decided anew when a step begins; within the step a contact
-that comes near, or that an increment of the bodies may bring near, is looked at from then on.
+The check uses bounding boxes of the surfaces, of all contacts by one reduction, at the beginning of each step. Within the step, a contact
+is searched as soon as its surfaces come near, or may come near by an increment.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ FACETS_AWAY = 1.0
 
 
 class Boxes(NamedTuple):
-    """How far boxes around surfaces are from each other, in one configuration; lengths.
+    """Distances between bounding boxes of surfaces, in one configuration; lengths.
 
     Attributes:
-        between: along every axis, both ways round, of meshed targets ``(n_meshed, 2 gdim)``.
+        between: along every axis, in both directions, for meshed targets ``(n_meshed, 2 gdim)``.
         middle: of the boxes around the contactors of rigid targets ``(n_rigid, gdim)``.
         radius: half of their diagonals ``(n_rigid,)``.
         distance: of their middles from the targets ``(n_rigid,)``.
@@ -40,12 +40,12 @@ class Boxes(NamedTuple):
 
     @property
     def apart(self) -> Array:
-        """No distance between the surfaces is less: meshed ones first ``(n_pairs,)``."""
+        """Lower bounds of the distances between the surfaces, meshed targets first ``(n_pairs,)``."""
         return np.concatenate([self.between.max(axis=1), self.distance - self.radius])
 
     def apart_until(self, then: Boxes) -> Array:
-        """Nor is any on straight ways of all nodes to where they are ``then``."""
-        # what is on one side of the other along an axis, before and after, is so on the way
+        """Lower bounds of the distances during straight motions of all nodes to the configuration of ``then`` ``(n_pairs,)``."""
+        # surfaces separated along an axis before and after are separated in between
         meshed = np.minimum(self.between, then.between).max(axis=1)
         way = np.linalg.norm(then.middle - self.middle, axis=1)
         rigid = 0.5 * (self.distance + then.distance - way) - np.maximum(self.radius, then.radius)
@@ -53,9 +53,9 @@ class Boxes(NamedTuple):
 
 
 class FarApart:
-    """Which contacts of a problem are not looked at (collective).
+    """Contacts of a problem that are not searched (collective).
 
-    Asked are contacts of nodes at finite sliding with the facets of a mesh, or with rigid surfaces whose gap is a distance everywhere.
+    Only node-to-surface contacts with finite sliding can be skipped, with meshes, or with rigid surfaces whose gap is a distance.
 
     Args:
         config: configuration of the displacement.
@@ -71,39 +71,39 @@ class FarApart:
         surfaces = {id(target.facets): target.dofs for target in targets}
         unique = {key: np.unique(dofs) for key, dofs in surfaces.items()}
         number = {id(pair): k for k, pair in enumerate(self._pairs)}
-        #: What they are treated as, and places of its members among them.
+        #: Interfaces in use, and the indices of their members in ``_pairs``.
         self._wholes = [pair for pair in pairs if _may_be_far(pair)]
         self._places: list[Ints] = [np.array([number[id(one)] for one in pair.members]) for pair in self._wholes]
         sides = [pair.nodes for pair in self._pairs] + [unique[id(target.facets)] for target in targets]
         lengths = np.array([len(side) for side in sides], np.int64)
-        #: Nodes of all surfaces, those that have any on this rank, and where theirs begin.
+        #: Nodes of all surfaces, the surfaces with nodes on this rank, and the start of their nodes.
         self._nodes: Ints = np.concatenate([np.zeros(0, np.int64), *sides])
         self._here: Ints = np.flatnonzero(lengths)
         self._begin: Ints = (np.cumsum(lengths) - lengths)[self._here]
         self._n_surfaces = len(sides)
-        # facets of higher degree may leave the box around their nodes
+        # facets of higher degree may exceed the box around their nodes
         self._out = np.array([0.5 * (target.shape.lebesgue - 1) for target in targets])
         longest = np.zeros(len(self._pairs))
         size = {key: np.linalg.norm(np.ptp(config.X[dofs], axis=1), axis=1).max(initial=0.0) for key, dofs in surfaces.items()}
         longest[: len(targets)] = [size[id(target.facets)] for target in targets]
         if some:
             config.comm.Allreduce(MPI.IN_PLACE, longest, op=MPI.MAX)
-        #: What is near, and with offsets ``(n_pairs,)``; boxes where the bodies were when last asked.
+        #: Distances that count as near, without and with offsets ``(n_pairs,)``; boxes of the last check.
         self._reach = self._near = FACETS_AWAY * longest
         self._boxes: Boxes
 
     def begin_step(self, falls: bool) -> None:
-        """Decide which contacts are far apart, where the bodies are now (collective).
+        """Decide which contacts are too far away, at the present positions (collective).
 
         Args:
-            falls: whether bodies fall in statics, for which gaps to rigid surfaces tell how far they may go at once.
+            falls: whether bodies fall in statics, since gaps to rigid surfaces then limit their motion.
         """
         if not self._pairs:
             return
         offsets = [pair.discretisation.offset for pair in self._pairs]
         more = np.zeros((2, len(self._pairs)))
         more[0] = [0.0 if offset is None else offset.max(initial=0.0) for offset in offsets]
-        # what touches, or has slid past an end, is looked at
+        # contacts with active contactors, or contactors past an end, are searched
         for place, p in zip(self._places, self._wholes):
             used = p.trial.active | p.trial.passed | p.trial.barred
             more[1, place[p.label[used]]] = 1.0
@@ -115,13 +115,13 @@ class FarApart:
             pair.project()
 
     def place(self) -> None:
-        """Look at those that are near where the bodies are now, from the next placement on (collective)."""
+        """Search contacts that are near at the present positions, from the next projection on (collective)."""
         if self.any:
             self._boxes, _ = self._look(self._config.x)
             self._look_at(self._boxes.apart <= self._near)
 
     def look_within(self, way: float) -> bool:
-        """Look at those that may come near if nodes move by no more than ``way`` along any axis, a length: whether any may (collective)."""
+        """Search contacts that may come near if nodes move by at most ``way`` along each axis; whether there are new ones (collective)."""
         if not self.any:
             return False
         found = self._look_at(self._boxes.apart <= self._near + 2.0 * np.sqrt(self._config.gdim) * way)
@@ -130,7 +130,7 @@ class FarApart:
         return bool(found)
 
     def look_along(self, ways: Array) -> bool:
-        """Look at those that may come near on straight ways of the local nodes ``(n_local, gdim)``: whether any may (collective)."""
+        """Search contacts that may come near in straight motions ``(n_local, gdim)``; whether there are new ones (collective)."""
         if not self.any:
             return False
         then, _ = self._look(self._config.x + ways)
@@ -138,11 +138,11 @@ class FarApart:
 
     @property
     def any(self) -> bool:
-        """Whether a contact is not looked at."""
+        """Whether any contact is not searched."""
         return bool(self._far.any())
 
     def _look(self, x: Array, more: Array | None = None) -> tuple[Boxes, Array]:
-        """Boxes with the local nodes at ``x (n_local, gdim)``, and the largest over all ranks of ``more (k, n_pairs)`` (collective)."""
+        """Boxes with the local nodes at ``x (n_local, gdim)``, and the maximum over all ranks of ``more (k, n_pairs)`` (collective)."""
         n, g = len(self._pairs), self._config.gdim
         # negative lower and upper corners
         corners = np.full((self._n_surfaces, 2 * g), -np.inf)
@@ -163,21 +163,21 @@ class FarApart:
 
     @property
     def _far(self) -> Bools:
-        """Which contacts are not looked at ``(n_pairs,)``."""
+        """Mask of contacts that are not searched ``(n_pairs,)``."""
         far = np.zeros(len(self._pairs), dtype=bool)
         for place, pair in zip(self._places, self._wholes):
             far[place] = pair.far_of
         return far
 
     def _set(self, far: Bools) -> list[Interface]:
-        """Look at contacts or not ``(n_pairs,)``; those are returned of which that is new, as they are treated."""
+        """Set the mask of contacts that are not searched ``(n_pairs,)``; returns the interfaces for which it has changed."""
         found = [(place, p) for place, p in zip(self._places, self._wholes) if (far[place] != p.far_of).any()]
         for place, pair in found:
             pair.far_of = far[place]
         return [pair for _, pair in found]
 
     def _look_at(self, near: Bools) -> list[Interface]:
-        """Look at those of the contacts ``near (n_pairs,)`` that have not been looked at, which are returned as they are treated."""
+        """Search the contacts in the mask ``near (n_pairs,)``, too; returns the interfaces that were not searched before."""
         return self._set(self._far & ~near)
 
 

@@ -1,6 +1,6 @@
-"""Derivatives at the present displacement: the tangent K of the bodies, the curvature of the contact, and cells turned inside out.
+"""Derivatives at the present displacement: the tangent K of the bodies, the curvature of the contact, and inverted cells.
 
-A part of the seventh step on the data's way; K is assembled only when something it depends on has changed.
+K is assembled only if something that it depends on has changed.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 
 class Tangent:
-    """K = dF/du, with the mass's part of it in dynamics, assembled when it has changed.
+    """K = dF/du, with the mass term in dynamics, assembled when it has changed.
 
     Args:
         F: UFL residual.
         config: configuration of the displacement.
-        materials: whose stresses in F are no expressions of u; they add their stiffness.
-        dynamics: whose inertia forces depend on u, or None.
+        materials: laws with stresses that are no expressions of u; they add their stiffness.
+        dynamics: inertia, which adds a multiple of M, or None.
         points: loads and springs at nodes, or None.
 
     Raises:
@@ -71,22 +71,22 @@ class Tangent:
         self.K: PETSc.Mat = self._unknowns.create_matrix(self._form)
         #: Components without Dirichlet condition ``(n_rows, gdim)``.
         self._free: Bools = np.ones((0, 0), dtype=bool)
-        #: Components that nothing of K resists, without Dirichlet condition ``(n_rows * gdim,)``; None for none on any rank.
+        #: Mask of free components without stiffness ``(n_rows * gdim,)``; None if there are none on any rank.
         self.bare: Bools | None = None
-        #: Whether K has zeros on its diagonal, which is completed where components are held.
+        #: Whether K has zeros on its diagonal, which is completed at prescribed components.
         self._lacks = config.unknowns.mixed
-        #: Grows with every assembly.
+        #: Number of assemblies.
         self.number = 0
 
     def hold(self, free: Bools) -> None:
-        """Take which components have no Dirichlet condition ``(n_rows, gdim)``; K has places for all of them."""
+        """Set the mask of components without Dirichlet condition ``(n_rows, gdim)``; the sparsity of K includes all components."""
         self._free = free
         if self._lacks:
-            # its diagonal was completed where others were held
+            # its diagonal was completed for other conditions
             self._values = None
 
     def update(self) -> None:
-        """Assemble K unless nothing it depends on has changed (collective)."""
+        """Assemble K if something that it depends on has changed (collective)."""
         values = [np.array(forms.values_of(c)) for c in self._inputs]
         factor = self._dynamics.factor if self._dynamics is not None else 0.0
         same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
@@ -105,7 +105,7 @@ class Tangent:
         self.number += 1
 
     def _complete(self, comm: MPI.Comm) -> None:
-        """Complete the diagonal of K, and see where nothing but a coupling or a contact can resist (collective)."""
+        """Complete the diagonal of K, and find free components without stiffness of the bodies (collective)."""
         zero, mixed = self.K.getDiagonal().array_r == 0.0, self._unknowns.mixed
         self._lacks = bool(reduced(comm, int(zero.any()), op=MPI.MAX)) or mixed
         self.bare = None
@@ -121,11 +121,11 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
     """Matrix of ``-sum lambda grad^2 g``, to be added to K (collective).
 
     Args:
-        parts: of every pair, global nodes ``(k, m)``, negative where there is none, and the blocks ``(k, m gdim, m gdim)``.
+        parts: of every pair, global nodes ``(k, m)``, negative if missing, and the blocks ``(k, m gdim, m gdim)``.
         du: a vector with the displacement's layout.
     """
     g = du.getBlockSize()
-    # how many blocks meet at each node bounds the length of its rows
+    # the number of blocks at each node bounds the length of its rows
     counts = du.duplicate()
     counts.set(0.0)
     for nodes, _ in parts:
@@ -143,7 +143,7 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
         comm=du.comm,
     )
     G.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
-    # a rank without nodes would not be told, and then assemble otherwise than the others
+    # set explicitly, since ranks without nodes would otherwise assemble differently
     G.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
     for nodes, blocks in parts:
         if len(nodes):
@@ -154,7 +154,7 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
 
 
 def convex_part(blocks: Array) -> Array:
-    """Blocks ``(k, n, n)`` without the negative eigenvalues of those that are symmetric."""
+    """Blocks ``(k, n, n)``, without negative eigenvalues in symmetric blocks."""
     out = blocks.copy()
     which = np.flatnonzero((blocks == blocks.transpose(0, 2, 1)).all(axis=(1, 2)))
     value, vector = np.linalg.eigh(blocks[which])
@@ -165,14 +165,14 @@ def convex_part(blocks: Array) -> Array:
 def curvature_of(
     pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex: bool, linear: UserRows | None = None
 ) -> PETSc.Mat | None:
-    """``-sum lambda grad^2 g`` of all pairs, and likewise of rigid couplings, or None if there is none (collective).
+    """``-sum lambda grad^2 g`` of all pairs and of rigid couplings, or None if it vanishes (collective).
 
     Args:
         pairs: of all contacts.
         du: a vector with the displacement's layout.
-        apart: whether P differs from Q; else the symmetric part counts.
-        convex: whether what could make the tangent indefinite is left out.
-        linear: equations of users; None for none.
+        apart: whether P differs from Q; otherwise only the symmetric part is used.
+        convex: whether terms that could make the tangent indefinite are neglected.
+        linear: equations of users, or None.
     """
     moving = [pair for pair in pairs if pair.sliding == "finite"]
     if not moving and linear is None:
@@ -180,17 +180,17 @@ def curvature_of(
     parts = [part for pair in moving for part in pair.curvature()]
     parts += [] if linear is None else linear.curvature()
     for i, (nodes, blocks) in enumerate(parts):
-        # one after the other takes the place of what it was made of
+        # in place, to save memory
         blocks = convex_part(blocks) if convex else blocks
         parts[i] = nodes, blocks if apart else 0.5 * (blocks + blocks.transpose(0, 2, 1))
-    # a plane has none
+    # it vanishes e.g. for a plane
     if not reduced(du.comm.tompi4py(), any(blocks.any() for _, blocks in parts)):
         return None
     return contact_curvature(parts, du)
 
 
 def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:
-    """Forces of friction that do not grow with those along the normal, of pairs of which any rank has some (collective)."""
+    """Frictional forces that are independent of normal forces, of pairs with such forces on any rank (collective)."""
     if not any(pair.frictional for pair in pairs):
         return []
     told = reduced(pairs[0].config.comm, np.array([pair.has_known_forces for pair in pairs]), op=MPI.LOR)
@@ -200,15 +200,15 @@ def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:
 def slip_terms(
     pairs: Sequence[Interface], du: PETSc.Vec, linear: UserRows | None = None
 ) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
-    """What the directions of slip, heat through contacts, and masses at points add to the tangent, and slip to the residual (collective).
+    """Tangent terms of slip directions, heat through contacts and masses at points, and residual terms of slip (collective).
 
     Args:
         pairs: of all contacts.
         du: a vector with the layout of all unknowns.
-        linear: equations of users; None for none.
+        linear: equations of users, or None.
 
     Returns:
-        Either of them None for nothing.
+        Matrix and vector, each None if it vanishes.
     """
     g, comm = du.getBlockSize(), du.comm.tompi4py()
     parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
@@ -232,7 +232,7 @@ def slip_terms(
 
 
 def added_mass(linear: UserRows | None, like: PETSc.Vec) -> PETSc.Mat | None:
-    """What masses at points of rigid couplings add to M, for vectors like this one; None without any (collective)."""
+    """Masses at points of rigid couplings as a matrix for vectors like this one, or None (collective)."""
     parts = [] if linear is None else linear.added_mass(1.0)
     return contact_curvature(parts, like) if parts else None
 
@@ -247,7 +247,7 @@ def together(A: PETSc.Mat | None, B: PETSc.Mat | None) -> PETSc.Mat | None:
 
 
 class Inversions:
-    """Looks for cells that the displacement turns inside out.
+    """Search for cells that the displacement inverts.
 
     Args:
         config: configuration of the displacement.
@@ -262,7 +262,7 @@ class Inversions:
             self._volume = forms.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
 
     def find(self) -> str | None:
-        """Where the worst of them is, if there are any (collective)."""
+        """Position of the worst inverted cell, or None (collective)."""
         config = self.config
         if forms.assemble_scalar(self._volume, config.comm) == 0.0:
             return None

@@ -1,4 +1,4 @@
-"""Load steps: the load grows from 0 to 1 in steps that are cut where they fail; every one that converges is committed."""
+"""Load steps: the load factor increases from 0 to 1 in steps that are cut on failure; every converged step is committed."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 def load_steps(
     problem: UnitedProblem, steps: int | Sequence[Step] = 1, *, arc_length: bool = False, checkpoint: Checkpoint | None = None
 ) -> Iterator[LoadStep]:
-    """Apply the load in steps, cut on failure, increased again after easy ones to the nominal length at most, with a progress bar.
+    """Apply the load in steps, cut on failure and increased again after easy steps, up to the nominal length, with a progress bar.
 
     Args:
         problem: problem to solve; its ``load`` is evaluated at factors from 0 to 1 and its Dirichlet values are ramped.
-        steps: nominal number of equal steps; after a cut they end again at multiples of their length. Or a list of ``Step``, each with a
-            number of its own, between which conditions, loads, contacts and coefficients change: the load factor goes from 0 to 1 in each.
-        arc_length: prescribe the load of the first step only, and its length in displacement for all others: the load factor is an
-            unknown, which rises up to limit points and falls beyond them, until it is 1. Dirichlet values are not ramped.
+        steps: nominal number of equal steps; after a cut they end again at multiples of their length. Or a list of ``Step``, each with
+            its own number, between which conditions, loads, contacts and coefficients change: the load factor runs from 0 to 1 in each.
+        arc_length: prescribe the load of the first step only, and its length in displacement for all other steps. The load factor is an
+            unknown, which increases up to limit points and decreases beyond them, until it is 1. Dirichlet values are not ramped.
         checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
             in ``checkpoint.begin(problem.state())``, which writers with ``resume=True`` need. On restart, calls of ``load_steps``
             that the checkpoint has already passed yield no steps.
@@ -46,12 +46,12 @@ def load_steps(
         An iterator of converged steps.
 
     Raises:
-        InputError, InputTypeError: if ``steps`` is no whole number, 1 or more, nor a list of ``Step``, or one of these is not of this
-            problem; with ``arc_length`` if no load moves the bodies, or Dirichlet values do, or there are several ``Step``.
+        InputError, InputTypeError: if ``steps`` is neither a positive whole number nor a list of ``Step``, or if a step is not of this
+            problem; with ``arc_length`` if no load moves the bodies, if Dirichlet values do, or for a list of ``Step``.
         CheckpointError: see ``Checkpoint``.
-        ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
-        LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: likewise.
-        KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
+        ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: if a step fails even at 1/1024 of its
+            nominal length; the last converged state is kept.
+        KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM; the last converged state is kept.
     """
     check_steps(problem, checkpoint)
     several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
@@ -83,7 +83,7 @@ def load_steps(
 
 
 def _in_stages(problem: UnitedProblem, steps: Sequence[Step]) -> Iterator[LoadStep]:
-    """The load steps of several ``Step``, one after the other, or up to where a run before the checkpoint has left them."""
+    """The load steps of several ``Step``, or, on restart, up to the load factor at which the earlier run has left them."""
     from uem_dolfinx.solve.steps.stages import Stage
 
     progress = problem.progress
@@ -109,7 +109,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         return
     if progress.factor != 0.0:
         problem.set_load(progress.factor)
-    #: the last load factor at which an equilibrium was found that is unstable
+    #: load factor of the last unstable equilibrium
     unstable: float | None = None
     while progress.factor < 1.0:
         done = progress.factor
@@ -138,11 +138,11 @@ class ByLoad:
     """Advances a problem by steps of given load.
 
     Args:
-        problem: what is loaded.
+        problem: the problem.
 
     Attributes:
-        tried: part of the load that the last step was meant to add.
-        most: number of steps, over the nominal one, after which the path is given up: this one ends.
+        tried: intended load increment of the last step.
+        most: largest number of steps relative to the nominal one, here unlimited.
     """
 
     def __init__(self, problem: UnitedProblem):
@@ -157,7 +157,7 @@ class ByLoad:
         """
         progress = self._problem.progress
         factor = _next_factor(done, progress.control)
-        # it may be shorter than was meant
+        # it may be shorter than the controlled length
         self.tried = factor - done
         if self._problem.verbose:
             say(f"load step {progress.control.number + 1}, to load factor {factor:.6g}")
@@ -166,7 +166,7 @@ class ByLoad:
 
 
 def _next_factor(done: float, control: StepControl) -> float:
-    """Load factor at the end of the next step: after a cut, no further than the multiple of the nominal length that was to be reached."""
+    """Load factor at the end of the next step, at most the next multiple of the nominal length."""
     nominal = control.nominal
     goal = min((np.floor(done / nominal + REMAINDER) + 1.0) * nominal, 1.0)
     factor = min(done + control.length, goal)

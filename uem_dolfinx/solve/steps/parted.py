@@ -1,4 +1,4 @@
-"""Contacts that were treated together, one by one from now on, for what is asked of each alone."""
+"""Separation of joined contacts, for operations on single contacts."""
 
 from __future__ import annotations
 

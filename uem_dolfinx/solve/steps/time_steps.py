@@ -1,6 +1,6 @@
-"""Time steps: shortened where they fail, where contacts would give the bodies energy, and at instants of contact [UEM, 5].
+"""Time steps, shortened on failure, if contacts would add energy to the bodies, and at instants of contact [UEM, 5].
 
-Every step that converges is committed, so that a run that fails keeps its last good state.
+Every converged step is committed, so that a failed run keeps its last converged state.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class TimeStep(ConvergedStep):
         time: reached.
         dt: length of the step.
         iterations: history of the Newton loop.
-        cuts: how often the step had to be shortened.
-        touched: names of the contacts that had no active contactor before the step and have one now.
-        left: names of those that had one and have none now.
+        cuts: number of times that the step was shortened.
+        touched: names of the contacts that had no active contactor before the step, and have one after it.
+        left: names of the contacts that had an active contactor before the step, and have none after it.
     """
 
     number: int
@@ -64,7 +64,7 @@ class TimeStep(ConvergedStep):
     left: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Which step it is, its time, and which contacts have touched or come apart in it."""
+        """Its number and time, and the contacts that have closed or opened in it."""
         events = [f"{word} {', '.join(names)}" for word, names in (("touched:", self.touched), ("left:", self.left)) if names]
         return ", ".join([f"time step {self.number}, time {self.time:.6g}", *events])
 
@@ -107,8 +107,8 @@ def time_steps(
         TunnellingError: if a contactor passes through a target even in the shortest step.
         EnergyGivenError: if impact adds energy to the bodies even in the shortest step.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
-        LinearSolveError, NotFiniteError, InvertedElementError: likewise.
-        KeyboardInterrupt, SystemExit: on all ranks, if any has got Ctrl-C or SIGTERM; the last converged state is kept.
+        LinearSolveError, NotFiniteError, InvertedElementError: if a step fails even at 1/1024 of its nominal length.
+        KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM; the last converged state is kept.
     """
     check_steps(problem, checkpoint)
     dynamics = problem.dynamics
@@ -146,7 +146,7 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
         problem.history.note_start()
     before, rounding = _touching(problem), _rounding(dynamics, dt, end)
     while (remainder := end - dynamics.time) > rounding:
-        # to the next multiple of dt; whole steps are equally long to the last bit, so that K stays what it is
+        # to the next multiple of dt; whole steps have equal lengths to the last bit, so that K does not change
         passed = (dynamics.time - dynamics.start) / dt
         rest = min((np.floor(passed + rounding / dt) + 1.0 - passed) * dt, remainder)
         length = min(control.longest, dt if abs(rest - dt) <= rounding else rest)
@@ -171,16 +171,16 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
         touched = tuple(name for name, was, now in changes if now and not was)
         left = tuple(name for name, was, now in changes if was and not now)
         yield TimeStep(number, dynamics.time, length, iterations, cuts, touched, left)
-        # the caller may have taken the step again
+        # the caller may have repeated the step
         before = _touching(problem)
 
 
 def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:
-    """Attempt a step, or the part of it before the first touch or departure: its length and history (collective)."""
+    """Attempt a step, or its part before the first contact closes or opens; returns its length and history (collective)."""
     iterations = _attempt(problem, length)
     if tolerance is None or length <= tolerance or _touching(problem) == before:
         return length, iterations
-    # the first trial asks whether the step begins at the instant
+    # the first trial checks whether the step begins at the instant
     low, high, trial, reached = 0.0, length, tolerance, 0.0
     while high - low > tolerance:
         problem.restore()
@@ -191,7 +191,7 @@ def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: 
         except MENDABLE:
             same = False
         except PrecisionError:
-            # a step so short that rounding hides its forces: the instant is looked for later
+            # the step is so short that rounding exceeds its forces: the instant is later
             same = True
         low, high = (trial, high) if same else (low, trial)
         trial = 0.5 * (low + high)
@@ -211,18 +211,18 @@ def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
 
 
 def _contact_forces(problem: UnitedProblem) -> list[Array]:
-    """Contact forces on both bodies of each contact that does no work by itself, at this rank's nodes (collective)."""
+    """Contact forces on both bodies, at this rank's nodes, of each contact that should do no work (collective)."""
     touching = compress(problem.contacts, _touching(problem))
     own = slice(problem.config.gdim * problem.config.n_owned)
     return [np.array(c.force.x.array[own]) for c in touching if not c.pair.works]
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
-    """Refuse a step within which contacts have given the bodies energy, by more than their share; warn of it with mass (collective).
+    """Refuse a step in which contacts have added energy beyond the limit; with massive contactors only warn (collective).
 
-    The trapezoidal rule lets contactors that are let go, or slide round a bend, take half of their force at the beginning along, the
-    less the shorter the step. One that has sunk beside the target's end and is taken back gives a blow in however short a step; from the
-    next attempt on it is left out. Contactors with mass are given energy in steps of any length.
+    In the trapezoidal rule, contactors that are released or slide round a bend do work with half of their initial force; it decreases
+    with the step length. A contactor that has sunk past the target's end and is put back causes an impact in any step, and is ignored
+    from the next attempt on. Contactors with mass gain energy in steps of any length.
 
     Args:
         problem: at the end of the step.
@@ -231,7 +231,7 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
         before: contact forces at its beginning.
 
     Raises:
-        EnergyGivenError: if they have, and a shorter step or another attempt may be better.
+        EnergyGivenError: if a shorter step or another attempt may be better.
     """
     control = problem.step_control
     if not (forces := before + _contact_forces(problem)):
@@ -265,16 +265,16 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
 
 
 def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
-    """Energy that contact forces ``(n_owned * gdim,)`` hold in the cells they press, the mean of a step's start and end (collective).
+    """Strain energy of contact forces ``(n_owned * gdim,)`` in adjacent cells, mean of a step's start and end (collective).
 
-    Of bodies at rest it is what the work of these forces is compared with: their kinetic energy is the rounding of nothing.
+    For bodies at rest it is the reference for the work of these forces, since their kinetic energy is only rounding.
     """
     K = problem.bodies.stiffness
     if K is None:
         return 0.0
     compliance = np.where(K > 0.0, 1.0 / np.where(K > 0.0, K, 1.0), 0.0).ravel()
     held = sum(0.25 * float(f @ (compliance * f)) for f in forces)
-    # of gaps that count as closed, which rounding leaves
+    # plus the energy of gaps that count as closed, due to rounding
     open_still = CLOSED * problem.config.size
     pressed = np.logical_or.reduce([f != 0.0 for f in forces])
     held += 0.5 * float(K.ravel()[pressed].sum()) * open_still**2
@@ -282,7 +282,7 @@ def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
 
 
 def _touching(problem: UnitedProblem) -> list[bool]:
-    """Which contacts have active contactors (collective)."""
+    """Whether each contact has active contactors (collective)."""
     if not problem.contacts:
         return []
     active = np.array([bool(contact.pair.united.any()) for contact in problem.contacts])
@@ -290,10 +290,10 @@ def _touching(problem: UnitedProblem) -> list[bool]:
 
 
 def _not_before(start: float) -> given.Range:
-    """Times that steps can end at."""
+    """Range of valid end times."""
     return given.Range(f"a time that is not before the start, {start:.6g}", lambda t: start <= t < np.inf)
 
 
 def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:
-    """Difference of times that means nothing."""
+    """Difference of times that counts as rounding."""
     return max(REMAINDER * dt, TIME_ROUNDING * max(abs(dynamics.start), abs(end)))
