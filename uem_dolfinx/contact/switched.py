@@ -1,4 +1,4 @@
-"""Contacts between two steps: switched off and on, and parameters that go from one value to another."""
+"""Changes of contacts between steps: switching, and ramps of parameters."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from uem_dolfinx.parallel import agree, agreed, reduced
 
 
 def switch_off(pair: Interface) -> None:
-    """Let a pair touch nothing; what it has slipped, worn and dissipated stays (collective)."""
+    """Open a pair permanently; accumulated slip, wear and dissipation are kept (collective)."""
     if pair.tie is not None:
         pair.tie.untie()
     n, g, f, none = len(pair.nodes), pair.config.gdim, pair.committed.friction, np.zeros(len(pair.nodes), dtype=bool)
@@ -39,7 +39,7 @@ def switch_off(pair: Interface) -> None:
 
 
 def switch_on(pair: Interface) -> None:
-    """Let a pair begin as at the start of a problem, where bodies and target are now (collective).
+    """Start contact of a pair in the current configuration, as at the start of a problem (collective).
 
     Raises:
         PenetrationError: if a contactor is deeper inside than ``max_penetration``.
@@ -51,15 +51,15 @@ def switch_on(pair: Interface) -> None:
 
 
 def hold(pair: Interface, free: Bools, changed: Bools | None) -> None:
-    """Take other Dirichlet conditions (collective).
+    """Set other Dirichlet conditions (collective).
 
     Args:
-        pair: that is told.
+        pair: interface.
         free: components of the owned nodes without condition ``(n_owned, gdim)``.
-        changed: local nodes whose conditions have changed since the last step ``(n_local,)``; None if it has been made with them.
+        changed: local nodes whose conditions have changed since the last step ``(n_local,)``; None if the last step had the same.
 
     Raises:
-        InputError: if its discretisation takes no other conditions, or they change at nodes whose tie knows of them.
+        InputError: if its discretisation cannot change conditions, or they change at nodes of a tie that depends on them.
     """
     config, own, tie = pair.config, pair.discretisation, pair.tie
     tied = tie is not None and bool(reduced(config.comm, int(tie.tied.sum())))
@@ -77,13 +77,13 @@ def hold(pair: Interface, free: Bools, changed: Bools | None) -> None:
     if pair.friction is not None:
         pair.friction.free = free[pair.nodes]
     if tied and changed is None:
-        # its rows were made under those of the script's beginning
+        # its rows were made with the conditions at the beginning of the script
         pair.from_checkpoint(pair.to_checkpoint())
     settle(pair)
 
 
 def _refuse_at_ties(tie: Tie, changed: Bools) -> None:
-    """Raise if conditions have changed at local nodes ``(n_local,)`` that are tied, or followed by what is (collective)."""
+    """Raise if conditions have changed at local nodes ``(n_local,)`` that are tied, or followed by tied nodes (collective)."""
     config = tie.config
     followed = tie.followed_by_ties()
     here = changed[: config.n_owned, None].astype(float)
@@ -100,18 +100,18 @@ def _refuse_at_ties(tie: Tie, changed: Bools) -> None:
 
 
 def settle(pair: Interface, memory: Any = None) -> None:
-    """Place a committed state, or what ``Interface.memory`` is given, under the present conditions and offsets (collective)."""
+    """Place the committed state, or one from ``Interface.memory``, with the present conditions and offsets (collective)."""
     pair.remember(pair.memory() if memory is None else memory)
     pair.project()
 
 
 def take_friction(contact: Contact, law: Field | FrictionLaw, known: bool) -> None:
-    """Let friction of a contact follow the load factor from 0 on by a law (collective).
+    """Set a friction law that depends on the load factor, which starts at 0 (collective).
 
     Args:
-        contact: made with friction by such a law.
-        law: as of ``blended``.
-        known: whether the committed state has been reached with it, at a factor that the contact is told next.
+        contact: with friction of this kind of law.
+        law: see ``blended_friction``.
+        known: whether the committed state belongs to it, at a load factor that is set next.
 
     Raises:
         InputError, InputTypeError: as the setter of ``Contact.friction``.
@@ -124,13 +124,13 @@ def take_friction(contact: Contact, law: Field | FrictionLaw, known: bool) -> No
 
 
 def leave_friction(contact: Contact, to: Field | FrictionLaw, at: float) -> None:
-    """Let friction that has gone to ``to`` stay what it is at a load factor."""
+    """Freeze friction that was ramped to ``to`` at its value for a load factor."""
     there = at == 1.0 and not follows_load(as_law(to))
     contact._friction = to if there else _with_field(contact._friction, _frozen(as_law(contact._friction), at))
 
 
 def take_preload(bolt: Preload, force: Callable[[float], float] | None, known: bool) -> None:
-    """Let a section carry a force that follows the load factor from 0 on, or lock it with None; ``known`` as above (collective)."""
+    """Set a section force that depends on the load factor from 0 on, or lock it with None; ``known`` as above (collective)."""
     if force is None and not known:
         bolt.lock()
     elif force is not None:
@@ -142,20 +142,20 @@ def take_preload(bolt: Preload, force: Callable[[float], float] | None, known: b
 
 
 def leave_preload(bolt: Preload, at: float) -> None:
-    """Let the force stay what it is at a load factor."""
+    """Freeze the force at its value for a load factor."""
     bolt._force = bolt._force(at) if callable(bolt._force) else bolt._force
 
 
 def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[[float], float]) -> Field | FrictionLaw:
-    """Friction that goes from what it is to another, by a function of place and of the load factor.
+    """Friction ramped from its present to another value, as a function of position and load factor.
 
     Args:
         contact: whose friction it is.
-        to: friction at the end; a function of place and of the load factor is taken as it is.
-        share: of the way that is done at a load factor, from 0 to 1.
+        to: friction at the end; a function of position and load factor is used without a ramp.
+        share: function of the load factor that increases from 0 to 1.
 
     Raises:
-        InputError: if it follows a temperature now, and is to be another that does not.
+        InputError: if it depends on temperature now, and ``to`` does not.
     """
     if follows_load(as_law(to)):
         return to
@@ -171,19 +171,19 @@ def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[
 
 
 def between(a: Field, b: Field, share: float) -> Field:
-    """What lies at a part of the way from a to b, numbers or functions of place."""
+    """Linear interpolation between a and b, numbers or functions of position."""
     if not (callable(a) or callable(b)):
         return (1.0 - share) * a + share * b
     return lambda x: (1.0 - share) * value_at(a, x) + share * value_at(b, x)
 
 
 def value_at(field: Field, x: Array) -> Any:
-    """A number, or what a function of place returns at ``x (3, n)``."""
+    """A number, or the values of a function of position at ``x (3, n)``."""
     return np.asarray(field(x), dtype=float) if callable(field) else field
 
 
 def _frozen(law: FrictionLaw, at: float) -> Field:
-    """The law's parameter as it is at a load factor."""
+    """The law's parameter at a load factor."""
     f = law.field
     if isinstance(f, OfTemperature):
         return f.at(at)

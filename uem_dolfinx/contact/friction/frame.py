@@ -1,4 +1,4 @@
-"""Directions along the target at contactors with friction, and how far these have moved along them."""
+"""Tangential directions at frictional contactors, and their relative motions."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from uem_dolfinx.contact.seam.relative_motion import Ties
 
 @dataclass(frozen=True)
 class Frame:
-    """What friction sees of one placement: a value.
+    """Data of one placement for friction; immutable.
 
     Attributes:
-        ties: by what contactors follow other nodes, and hand friction on to them.
-        way: by what they are ``away``.
-        away: how far contactors are from their anchors, or have moved relative to what they follow since the last step ``(n, gdim)``.
-        tangents: directions along the target ``(n, gdim - 1, gdim)``.
-        free_tangents: those in which nothing prescribes the relative motion ``(n, gdim - 1, gdim)``.
-        other_normals: normals of other rigid surfaces that hold the contactors, zero where none does ``(n, k, gdim)``.
+        ties: weights by which contactors follow other nodes and transmit friction to them.
+        way: weights of ``away``.
+        away: vectors from the anchors to the contactors, or relative motions since the last step ``(n, gdim)``.
+        tangents: tangential directions ``(n, gdim - 1, gdim)``.
+        free_tangents: tangential directions in which the relative motion is not prescribed ``(n, gdim - 1, gdim)``.
+        other_normals: normals of other rigid surfaces that hold the contactors, or zero ``(n, k, gdim)``.
         prescribed: whether any contactor has a Dirichlet condition.
-        cornered: contactors that a corner holds, along whose edge alone friction acts ``(n,)``.
+        cornered: contactors held in a corner, with friction only along its edge ``(n,)``.
     """
 
     ties: Ties
@@ -39,7 +39,7 @@ class Frame:
 
     @classmethod
     def of(cls, kinematics: Kinematics, away: Array, way: Ties | None, other_normals: Array, prescribed: bool) -> Frame:
-        """The frame of contactors that are this far ``away (n, gdim)``, by what others than now; other arguments as the attributes."""
+        """The frame for relative motions ``away (n, gdim)``; ``way`` is None for the present ``ties``; arguments as the attributes."""
         normals, ties, c = kinematics.normal[:, None], kinematics.ties, kinematics.corners
         n, g = away.shape
         cornered = np.zeros(n, dtype=bool)
@@ -54,7 +54,7 @@ class Frame:
         return cls(ties, way or ties, away, every, told, other_normals, prescribed, cornered)
 
     def along(self, way: Array) -> Array:
-        """Parts of relative motions ``(n, gdim)`` along the target; of what is prescribed, only of the motion itself."""
+        """Tangential parts of relative motions ``(n, gdim)``; prescribed components contribute only their own motion."""
         if not self.prescribed:
             return stick_slip.along(self.tangents, way)
         told = stick_slip.along(self.free_tangents, way) + stick_slip.along(self.tangents, np.where(self.ties.moves, 0.0, way))
@@ -62,26 +62,25 @@ class Frame:
 
     @cached_property
     def slip(self) -> Array:
-        """Motion along the target since the last step; of a contactor that sticks, how far it is off its anchor ``(n, gdim)``."""
+        """Tangential motion since the last step; for a sticking contactor, its offset from the anchor ``(n, gdim)``."""
         return self.along(self.away)
 
     def directions(self, vectors: Array) -> Array:
-        """Unit vectors along the target of ``vectors (n, gdim)``, zero for zero."""
+        """Tangential unit vectors of ``vectors (n, gdim)``, zero for zero."""
         s = self.along(vectors)
         size = np.linalg.norm(s, axis=1, keepdims=True)
         return s / np.where(size > 0, size, 1.0)
 
     def tangential(self, force: Array) -> Array:
-        """Parts of forces ``(n, gdim)`` along the target."""
+        """Tangential parts of forces ``(n, gdim)``."""
         return stick_slip.along(self.tangents, force)
 
     def forced(self, away: Array, left_out: Bools) -> Array:
-        """How far conditions and other surfaces take contactors over the target ``(n,)``.
+        """Length of the slip prescribed by conditions and other surfaces ``(n,)``.
 
         Args:
             away: relative motions ``(n, gdim)``.
-            left_out: tangents whose equations depend on others, where more conditions meet than the target can follow
-                ``(n, gdim - 1)``.
+            left_out: tangents with redundant equations, where more conditions meet than the target can follow ``(n, gdim - 1)``.
         """
         along = stick_slip.along(self.tangents, away) - stick_slip.along(self.free_tangents, away)
         told = np.where(self.other_normals.any(axis=(1, 2)), np.linalg.norm(along, axis=1), 0.0)

@@ -1,6 +1,6 @@
-"""Friction of an interface: equations of contactors that stick, rotated rows and forces of those that slip, along the target.
+"""Friction of an interface: tangential equations of sticking contactors, rotated rows and forces of slipping ones.
 
-``stick_slip`` decides on arrays which contactors stick and which slip, by a law's limit.
+``stick_slip`` contains the decision between stick and slip, on arrays, by a law's limit.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ class Sliding:
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
-        discretisation: what ties them to their target.
-        law: of friction.
-        value: of its parameter at the contactors ``(n,)``.
-        limits: how much of it contactors bear.
+        discretisation: relates them to their target.
+        law: friction law.
+        value: parameter of the law at the contactors ``(n,)``.
+        limits: limits of the friction forces.
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
-        keeps_feet: whether feet stay where they were at the start of the step.
-        value_now: tells the parameter's values ``(n,)`` where contactors have been placed, None for those of before (collective).
+        keeps_feet: whether closest points are constant during the step.
+        value_now: function that returns the parameter ``(n,)`` after a placement, or None if unchanged (collective).
 
     Attributes:
-        frame: directions along the target and relative motions, of the last placement.
-        pivot: what the exchanges of the present linearised problem have done.
-        wear: of the contactors; None without.
-        left_out: tangents whose equations depend on others and were left out ``(n, gdim - 1)``.
+        frame: tangential directions and relative motions of the last placement.
+        pivot: record of the exchanges in the present linearised problem.
+        wear: of the contactors; None without wear.
+        left_out: tangents whose equations are redundant and were dropped ``(n, gdim - 1)``.
     """
 
     frame: Frame
 
-    front: Any = Front  #: Makes what tells where slip begins, for another linearised problem.
+    front: Any = Front  #: Class of the slip front, made for each linearised problem.
 
     def __init__(
         self,
@@ -84,18 +84,18 @@ class Sliding:
         self.pivot = Pivot.begin(self.front(self.config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
 
     def set(self, law: FrictionLaw, value: Array) -> None:
-        """Take a law, and the values of its parameter ``(n,)``."""
+        """Set the law and the values of its parameter ``(n,)``."""
         self.discretisation.with_friction(self.limits.set(law, value))
 
     @property
     def value(self) -> Array:
-        """Of the law's parameter at the contactors ``(n,)``, 0 where there is no friction."""
+        """Parameter of the law at the contactors ``(n,)``, 0 without friction."""
         return self.limits.value
 
     # -- where the contactors stand --------------------------------------------------------------------------------------
 
     def place(self, kinematics: Kinematics, state: FrictionState) -> None:
-        """Find the anchors, or how far contactors have moved, where bodies and target are now (collective)."""
+        """Find the anchors, or the relative motions of contactors, in the current configuration (collective)."""
         if self.discretisation.pointwise:
             self._anchors, self._held_by = anchors_of(state, self.discretisation.target, self.config.gdim == 3)
         elif self._last is None:
@@ -107,7 +107,7 @@ class Sliding:
         self.replace(kinematics)
 
     def replace(self, kinematics: Kinematics) -> None:
-        """Take other kinematics at the same displacement (collective)."""
+        """Replace the kinematics at the same displacement (collective)."""
         if self.discretisation.pointwise:
             way = None if self._held_by is None else Ties.of(self.config, self.nodes, self._held_by, None, True)
             away = kinematics.points - self._anchors
@@ -123,13 +123,13 @@ class Sliding:
         return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
 
     def meet(self, kinematics: Kinematics, normals: Array) -> None:
-        """Take the normals of other rigid surfaces that hold contactors ``(n, k, gdim)``, along which they do not slip (collective)."""
+        """Set the normals of other rigid surfaces that hold contactors ``(n, k, gdim)``, along which no slip is possible (collective)."""
         if reduced(self.config.comm, not np.array_equal(normals, self._other_normals), op=MPI.LOR):
             self._other_normals = normals
             self.replace(kinematics)
 
     def active(self, state: PairState) -> Bools:
-        """Active contactors that friction acts on ``(n,)``."""
+        """Active contactors with friction ``(n,)``."""
         return state.active & (self.value > 0)
 
     def slipping(self, state: PairState) -> Bools:
@@ -137,30 +137,30 @@ class Sliding:
         return self.active(state) & ~_of(state).stick
 
     def directions(self, state: PairState) -> Array:
-        """Directions of slip, which turn with the surface ``(n, gdim)``; zero for contactors that do not slip."""
+        """Slip directions in the current tangent plane ``(n, gdim)``; zero for contactors that do not slip."""
         return self.frame.directions(_of(state).direction)
 
     def distances(self, state: PairState, redundant: Bools) -> Array:
-        """Distances from the anchors that contactors stick to, zero for all others, lengths ``(n,)``."""
+        """Distances of sticking contactors from their anchors, zero for others, lengths ``(n,)``."""
         held = np.where(self.left_out[:, :, None], 0.0, self.frame.free_tangents)
         away = np.linalg.norm(stick_slip.along(held, self.frame.away), axis=1)
         return np.where(self.active(state) & _of(state).stick & ~redundant, away, 0.0)
 
     def return_vectors(self, state: PairState) -> Array:
-        """Displacements along the target that put contactors that stick back to their anchors ``(n, gdim)``."""
+        """Tangential displacements that return sticking contactors to their anchors ``(n, gdim)``."""
         return -np.where(self._at_anchors(state)[:, None], stick_slip.along(self.frame.free_tangents, self.frame.away), 0.0)
 
     def _at_anchors(self, state: PairState) -> Bools:
-        """Contactors that stick to a point of the target and are free to follow it ``(n,)``."""
+        """Contactors that stick to a point of the target and can follow it ``(n,)``."""
         stuck = self.active(state) & _of(state).stick & self.discretisation.pointwise
         return stuck & (self.free | ~self.frame.ties.moves).all(axis=1)
 
     def bound(self, state: PairState, lam: Array | None = None) -> Array:
-        """Largest force along the target of a state, or of it with other forces ``lam (n,)`` along the normal ``(n,)``."""
+        """Limit of the tangential force in a state, or with other normal forces ``lam (n,)``: ``(n,)``."""
         return self.limits.of(state.lam if lam is None else lam, self.slipping(state))[0]
 
     def hold_limits(self, lam: Array | None) -> Array:
-        """Let limits be those of forces ``lam (n,)`` along the normal; see ``Limits.hold``."""
+        """Fix the limits at normal forces ``lam (n,)``; see ``Limits.hold``."""
         return self.limits.hold(lam)
 
     def _cone(self, state: PairState) -> tuple[Array, Array]:
@@ -173,11 +173,11 @@ class Sliding:
     # -- stick and slip --------------------------------------------------------------------------------------------------
 
     def come_and_go(self, state: PairState, before: Bools) -> PairState:
-        """The state in which contactors that were not active ``before (n,)`` stick, and those that are no longer forget."""
+        """The state in which contactors that were not active ``before (n,)`` stick, and released ones are reset."""
         return replace(state, friction=stick_slip.come_and_go(_of(state), before, state.active, self.value > 0))
 
     def other_law(self, state: PairState, law: FrictionLaw, value: Array) -> PairState:
-        """The state with a law, and other values ``(n,)`` of its parameter: contactors that get friction stick where they are."""
+        """The state with another law and parameter values ``(n,)``; contactors that become frictional stick at their position."""
         was = state.active & (self.value > 0)
         self.set(law, value)
         now = stick_slip.come_and_go(_of(state), was, state.active & (value > 0), value > 0)
@@ -192,15 +192,15 @@ class Sliding:
         rounding: tuple[Array, float],
         du: Array | None,
     ) -> stick_slip.FrictionViolations:
-        """Add those that break the conditions of friction (collective).
+        """Add violations of the friction conditions (collective).
 
         Args:
-            violated: contactors that break the conditions of contact.
+            violated: violations of the contact conditions.
             state: of the interface.
-            seen: contact forces, here or predicted.
+            seen: contact forces, current or predicted.
             stiffness: of the contactors ``(n,)``.
-            rounding: forces ``(n,)`` and lengths below which they are zero.
-            du: increment of the owned nodes with which they are predicted ``(n_owned, gdim)``; None where the bodies are now.
+            rounding: forces ``(n,)`` and a length; smaller values count as zero.
+            du: increment of the owned nodes used for the prediction ``(n_owned, gdim)``; None for the current configuration.
         """
         away, tau = self.frame.away, _of(state).tau
         if du is not None and seen.tau is not None:
@@ -225,18 +225,18 @@ class Sliding:
         ahead: bool,
         enter: Callable[[PairState], PairState],
     ) -> tuple[PairState, bool]:
-        """Let wrong contactors change between stick and slip (collective).
+        """Exchange violated contactors between stick and slip (collective).
 
         Args:
-            violated: contactors to change.
+            violated: contactors to be exchanged.
             state: of the interface.
-            committed: that of the last step.
+            committed: state of the last step.
             kinematics: of the contactors.
-            ahead: whether those that are to follow slip ahead.
-            enter: takes contactors in and out of contact (collective).
+            ahead: whether contactors next to the slip front slip in advance.
+            enter: function that activates and releases contactors (collective).
 
         Returns:
-            The state, and whether any slip ahead.
+            The state, and whether any contactor slips in advance.
         """
         assert isinstance(violated, stick_slip.FrictionViolations)
         seen, pivot, share = violated.seen, self.pivot, kinematics.force_per_multiplier[:, None]
@@ -246,21 +246,21 @@ class Sliding:
             taken, tau = self._next_in_line(violated, state, kinematics.points, tau)
             pivot = replace(pivot, taken=taken)
         slide = violated.slide | pivot.taken if ahead else violated.slide
-        # one whose slip turns slips the other way first: where a surface turns back they would else follow one after the other; if it
-        # turns again it is held: where the bodies give way more than the surface has moved it would turn for ever. Nodes in space that
-        # begin to slip turn as long as the force q is beyond the cone; bodies that slide without end are held
+        # a contactor whose slip reverses first slips the other way, since contactors would otherwise reverse one by one; at the
+        # second reversal it sticks, since soft bodies would reverse for ever. Nodes in 3D that begin to slip change direction while
+        # the force q is outside the cone; unrestrained bodies (slip above the model's size) stick
         q, beyond = pivot.stiffness[:, None] * slip - tau / share, ~pivot.turned
         if space:
             beyond = (beyond | pivot.begun) & (np.linalg.norm(q, axis=1) > self.bound(state, lam) / share[:, 0])
         turns = violated.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
-        # one that has touched before and comes back slips: stuck it might pull, and be let go of for ever
+        # a contactor that touched before and re-enters slips: sticking could cause tension and endless release
         back = (violated.enter & (committed.active | pivot.released | forced) | violated.slide & forced) & (size > 0)
         changed = replace(violated, slide=slide, hold=violated.hold & ~turns)
         state = enter(replace(state, friction=stick_slip.exchange(_of(state), changed, tau)))
         led_by = pivot.stiffness[:, None] * slip if self.config.gdim == 3 else slip
         way = np.where((turns & ~forced)[:, None] & space, q, led_by)
         state = replace(state, friction=stick_slip.turned(_of(state), back | turns, way))
-        # from here the slip of a target that has moved under contactors adds c w to the forces that q belongs to
+        # the slip of a moving target under these contactors now contributes c w to the forces in q
         q, of_q, led = pivot.q.copy(), pivot.tau.copy(), slide | back | turns
         q[slide], q[back | turns] = -tau[slide] / share[slide], way[back | turns]
         of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
@@ -271,14 +271,14 @@ class Sliding:
     def _next_in_line(
         self, violated: stick_slip.FrictionViolations, state: PairState, at: Array, tau: Array
     ) -> tuple[Bools, Array]:
-        """Contactors that are to slip with those that begin to ``(n,)``, and forces that have theirs along (collective)."""
+        """Contactors next to the slip front that slip in advance ``(n,)``, and their forces (collective)."""
         stick, begin = self.active(state) & _of(state).stick, violated.slide & ~violated.driven
         near, force = self.pivot.front.along(begin, self.pivot.taken & stick, tau, at)
         near &= stick & ~begin & ~violated.release
         return near, np.where(near[:, None], self.frame.tangential(force), tau)
 
     def turn(self, state: PairState, kinematics: Kinematics, stiffness: Array) -> PairState:
-        """Begin another linearised problem: directions of slip from where contactors are and from the forces last predicted.
+        """Begin another linearised problem: slip directions from current positions and the last predicted forces.
 
         Args:
             state: of the interface.
@@ -292,7 +292,7 @@ class Sliding:
         k, ties = np.abs(stiffness).mean(axis=1, keepdims=True), frame.ties
         c = stick_slip.slip_stiffness(k[self.nodes, 0], ties.row, ties.weight, self.config.ask_owners(ties.followed, k)[:, 0])
         T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.force_per_multiplier[:, None]
-        # friction has no part in what is prescribed to stand still, and none but of the motion where all of that is prescribed
+        # prescribed components at rest carry no friction; if all are prescribed, only the moving ones do
         told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
         goes = frame.forced(frame.away, self._lost) > GAP_ROUNDING * self.config.size
         tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
@@ -303,7 +303,7 @@ class Sliding:
     # -- equations and forces --------------------------------------------------------------------------------------------
 
     def equations(self, own: Constraints, state: PairState, kinematics: Kinematics) -> Constraints:
-        """Equations with those along the target, and rotated test rows where contactors slip (collective)."""
+        """Equations with tangential ones for sticking contactors, and rotated test rows for slipping contactors (collective)."""
         return with_friction(
             own,
             self.frame,
@@ -317,7 +317,7 @@ class Sliding:
         )
 
     def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
-        """Take which equations along the target were left out; ``redundant (m,)`` of all."""
+        """Set which tangential equations were dropped; ``redundant (m,)`` refers to all equations."""
         which = equations.tangent >= 0
         self.left_out = np.zeros_like(self.left_out)
         self.left_out[equations.contactor[which], equations.tangent[which]] = redundant[which]
@@ -325,7 +325,7 @@ class Sliding:
     def forces(
         self, equations: Constraints, multipliers: Array, state: PairState, kinematics: Kinematics, du: Array | None
     ) -> Traction:
-        """Contact forces across and along the target from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
+        """Normal and tangential forces from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
         held = equations.tangent >= 0
         across = kinematics.forces(state, equations.across(), multipliers[~held])
         share, i = kinematics.force_per_multiplier, np.flatnonzero(held)
@@ -340,26 +340,26 @@ class Sliding:
         return across._replace(force=across.force + kinematics.nodal_friction(tau), tau=tau * share[:, None])
 
     def has_known_forces(self, state: PairState) -> bool:
-        """Whether friction of contactors of this rank may not grow with the force along the normal."""
+        """Whether friction of any contactor of this rank may be independent of the normal force."""
         return bool(self._cone(state)[0].any())
 
     def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array]:
-        """Friction of contactors that does not grow with the force along the normal: nodes and forces (collective)."""
+        """Friction forces independent of the normal force: nodes and forces (collective)."""
         rest, _ = self._cone(state)
         size = np.where(self.slipping(state), rest / kinematics.force_per_multiplier, 0.0)
         return self.frame.ties.handed_on(-size[:, None] * self.directions(state))
 
     @property
     def _follows_slip(self) -> bool:
-        """Whether friction changes as contactors that slip move: in space its direction, and by laws of rate its size."""
+        """Whether friction depends on the slip of slipping contactors: in 3D by its direction, with rate laws by its size."""
         return self.config.gdim == 3 or of_rate(self.limits.law)
 
     def turning(self, state: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array]:
-        """How friction changes as contactors that slip move over the target.
+        """Derivatives of friction by the slip of slipping contactors.
 
         Returns:
-            Projectors across their directions ``(k, g, g)``, the part of the force across them that is taken away ``(k,)``, and
-            stiffnesses, across them and, by laws of rate, along them ``(k, g, g)``.
+            Projectors across the slip directions ``(k, g, g)``, the removed part of the force across them ``(k,)``, and stiffnesses
+            across and, with rate laws, along them ``(k, g, g)``.
         """
         i = np.flatnonzero(self.slipping(state))
         T, s = self.frame.tangents[i], self.directions(state)[i]
@@ -374,7 +374,7 @@ class Sliding:
         return sideways, part, stiffness[:, None, None] * sideways + along[:, None, None] * forwards
 
     def slip_terms(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array, Array] | None:
-        """What slip adds to tangent and residual: directions that are held back, and friction that grows with the speed."""
+        """Terms of slip in tangent and residual: change of direction, and rate dependence."""
         if not self._follows_slip:
             return None
         i = np.flatnonzero(self.slipping(state))
@@ -386,9 +386,9 @@ class Sliding:
         return nodes, blocks, forces
 
     def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:
-        """Derivatives of the forces of friction with the rows along the target (collective).
+        """Derivatives of the tangential rows times friction forces (collective).
 
-        Contactors that stick at feet follow the same points in all directions: no turn of these counts.
+        For contactors that stick at points they vanish, since all components follow the same point.
         """
         slips = self.slipping(state) & (state.lam > 0)
         held = self.active(state) & _of(state).stick & (not self.discretisation.at_feet)
@@ -402,7 +402,7 @@ class Sliding:
     # -- from step to step -----------------------------------------------------------------------------------------------
 
     def anchored(self, state: PairState, kinematics: Kinematics) -> FrictionState:
-        """The state in which contactors that do not stick are anchored where they are."""
+        """The state in which contactors that do not stick get anchors at their current position."""
         f = _of(state)
         if not self.discretisation.pointwise:
             return f
@@ -423,21 +423,21 @@ class Sliding:
         return replace(state, friction=now)
 
     def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
-        """Friction at a step's end, ways for a unit of it at start and end ``(n, gdim)``, and the work it takes ``(n,)`` (collective)."""
+        """Friction at a step's end, slips per unit of friction at start and end ``(n, gdim)``, and dissipation ``(n,)`` (collective)."""
         share, held, (_, slope) = kinematics.force_per_multiplier[:, None], self.frame.cornered[:, None], self._cone(state)
-        # one that has stuck all along is where its anchor is, whatever rounding says
+        # a contactor that stuck throughout the step is at its anchor, up to rounding
         stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
         start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
-        # a contactor that changes facets slides over both
+        # in a corner, friction is the part within the cones of its facets
         tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope, end) * share, _of(state).tau)
         return tau, start, end, stick_slip.work(_of(committed).tau, tau, start, end, self.frame.cornered)
 
     def forget(self) -> None:
-        """Another step has been begun from."""
+        """Discard the reference of slip, after a change of the state from which the step begins."""
         self._last = None
 
     def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
-        """Ways past the target since the last step, for a unit of friction at its start and one at its end ``(n, gdim)`` (collective)."""
+        """Relative motions since the last step, per unit of friction at its start and at its end ``(n, gdim)`` (collective)."""
         share = kinematics.force_per_multiplier[:, None]
         if self._last is None:
             return (self.frame.away / share,) * 2

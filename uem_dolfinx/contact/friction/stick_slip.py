@@ -1,12 +1,12 @@
-"""Friction by elimination: which contactors stick, which slip and where to. Pure functions of arrays, without mesh or communication.
+"""Friction by elimination: stick, slip and slip directions of contactors. Pure functions of arrays, without mesh or communication.
 
-A contactor that sticks follows its anchor, a point of the target, in all components, in trial and test rows alike. One that slips in
-the direction s moves as without friction. Where its limit is ``b + mu lambda``, b is a known force along -s, and the rest
-goes along ``n - mu s``: its test row is rotated,
+A sticking contactor follows its anchor, a point of the target, in all components of trial and test rows. A contactor that slips in
+the direction s moves as without friction. If its limit is ``b + mu lambda``, b is a known force along -s, and the rest is along ``n
+- mu s``: its test row is rotated,
 
     trial  n . (du_i - sum_a N_a du_a) = -g,        test  (n - mu s) . (dv_i - sum_a N_a dv_a) = 0,
 
-so that the contact force ``lambda (n - mu s)`` does no work on the virtual motions Q. In space the direction follows the motion: with
+so that the contact force ``lambda (n - mu s)`` does no work on the virtual motions Q. In 3D the direction follows the motion: with
 the tangential force tau and the slip w since the last step, ``q = c w - tau`` has the direction ``s = q / |q|`` wherever
 ``tau = -mu lambda s`` and w is along s, whatever the stiffness c is (semismooth Newton: Alart and Curnier, 1991,
 doi:10.1016/0045-7825(91)90022-X; Hüeber, Stadler and Wohlmuth, 2008, doi:10.1137/060671061).
@@ -35,14 +35,14 @@ LEAST_TURN = 0.999
 
 @dataclass(frozen=True)
 class Seen:
-    """What friction decides by, where the bodies are or as predicted.
+    """Forces and slips that decide on stick and slip, current or predicted.
 
     Attributes:
-        lam: force along the normal ``(n,)``.
-        tau: force along the target ``(n, gdim)``.
-        bound: its limit ``(n,)``.
+        lam: normal force ``(n,)``.
+        tau: tangential force ``(n, gdim)``.
+        bound: limit of the tangential force ``(n,)``.
         slip: relative motion along the target since the last step ``(n, gdim)``.
-        forced: how far what is prescribed moves contactors over the target, a length ``(n,)``.
+        forced: prescribed part of the slip, a length ``(n,)``.
     """
 
     lam: Array
@@ -54,13 +54,13 @@ class Seen:
 
 @dataclass(frozen=True)
 class FrictionViolations(Violations):
-    """Contactors that break the conditions of contact or of friction, each ``(n,)``.
+    """Contactors that violate the conditions of contact or of friction, each ``(n,)``.
 
     Attributes:
-        slide: those that stick with more force than the limit.
-        hold: those whose slip turns against its direction.
-        driven: those that what is prescribed moves over the target.
-        seen: by what that was decided.
+        slide: sticking contactors whose force exceeds the limit.
+        hold: slipping contactors that move against their slip direction.
+        driven: contactors with prescribed slip.
+        seen: forces and slips for this decision.
     """
 
     slide: Bools
@@ -70,30 +70,30 @@ class FrictionViolations(Violations):
 
     @property
     def count(self) -> int:
-        """Number of wrong contactors."""
+        """Number of violated contactors."""
         return super().count + int(self.slide.sum() + self.hold.sum())
 
     @property
     def which(self) -> Bools:
-        """All of them ``(n,)``."""
+        """All violated contactors ``(n,)``."""
         return super().which | self.slide | self.hold
 
     def among(self, kept: Bools) -> FrictionViolations:
-        """Those alone that are ``kept (n,)``."""
+        """The violations of ``kept (n,)`` contactors."""
         own = super().among(kept)
         return replace(self, **vars(own), slide=self.slide & kept, hold=self.hold & kept)
 
     def of_contact(self) -> FrictionViolations:
-        """Those alone that break the conditions of contact: they enter or are released."""
+        """The violations of the contact conditions: contactors that enter or are released."""
         return self.among(self.enter | self.release)
 
     def on_first_touch(self, gap: Array, depth: float) -> FrictionViolations:
-        """As that of ``Violations``; friction changes with what is there."""
+        """See ``Violations``; violations of friction are kept."""
         return replace(self, **vars(super().on_first_touch(gap, depth)))
 
 
 def tangents(normals: Array, free: Bools) -> Array:
-    """Orthonormal directions across all normals ``(n, k, gdim)`` in the components ``free (n, gdim)``; zeros where there are fewer.
+    """Orthonormal directions perpendicular to all normals ``(n, k, gdim)`` in the components ``free (n, gdim)``, padded with zeros.
 
     Returns:
         ``(n, gdim - 1, gdim)``.
@@ -102,7 +102,7 @@ def tangents(normals: Array, free: Bools) -> Array:
     if g == 2:
         found = np.stack([-first[:, 1], first[:, 0]], axis=1)[:, None]
     else:
-        # the first is across the axis that the normal is farthest from
+        # the first is perpendicular to the axis with the largest angle to the normal
         across = cross_products(first, np.eye(3)[np.abs(first).argmin(axis=1)])
         found = np.stack([across, cross_products(first, across)], axis=1)
     size = np.linalg.norm(found, axis=2, keepdims=True)
@@ -114,10 +114,10 @@ def tangents(normals: Array, free: Bools) -> Array:
 
 
 def _left_by(normals: Array, free: Bools) -> Array:
-    """``tangents`` where several normals meet, or something is prescribed."""
+    """``tangents`` for several normals or prescribed components."""
     fixed = np.where(free, 0.0, 1.0)[:, :, None] * np.eye(normals.shape[2])
     _, size, axes = np.linalg.svd(np.concatenate([normals, fixed], axis=1))
-    # the last axes are those that neither the normal nor a prescribed component has a part in
+    # the last axes are perpendicular to normals and prescribed components
     return np.where((size[:, 1:] < PRESCRIBED)[:, :, None] & free[:, None], axes[:, 1:], 0.0)
 
 
@@ -136,16 +136,16 @@ def find_violations(
     force_rounding: Array | float,
     gap_rounding: float,
 ) -> FrictionViolations:
-    """Add the contactors that break the conditions of friction to those that break the conditions of contact.
+    """Add violations of the friction conditions to violations of the contact conditions.
 
     Args:
-        violated: contactors that break the conditions of contact.
+        violated: violations of the contact conditions.
         state: of the contactors.
-        frictional: those that friction acts on ``(n,)``.
+        frictional: active contactors with friction ``(n,)``.
         seen: forces and slips.
         stiffness: of the contactors, a force per length ``(n,)``.
-        force_rounding: forces below it are zero, of all or of each contactor ``(n,)``.
-        gap_rounding: lengths below it are zero.
+        force_rounding: smaller forces count as zero, for all or for each contactor ``(n,)``.
+        gap_rounding: smaller lengths count as zero.
     """
     staying = frictional & ~violated.release
     excess = np.linalg.norm(seen.tau, axis=1) - seen.bound
@@ -159,12 +159,12 @@ def find_violations(
 
 
 def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> FrictionState:
-    """The state in which contactors that break the conditions of friction have changed between stick and slip.
+    """The state after exchange of violated contactors between stick and slip.
 
     Args:
         state: of the contactors.
-        violated: those to change.
-        tau: contact force along the target ``(n, gdim)``; it points against the slip of those that begin to.
+        violated: contactors to be exchanged.
+        tau: tangential force ``(n, gdim)``, opposite to the slip direction of contactors that begin to slip.
     """
     size = np.linalg.norm(tau, axis=1, keepdims=True)
     direction = np.where(violated.slide[:, None], -tau / np.where(size > 0, size, 1.0), state.direction)
@@ -173,7 +173,7 @@ def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> 
 
 
 def come_and_go(state: FrictionState, before: Bools, now: Bools, frictional: Bools) -> FrictionState:
-    """The state in another active set: new contactors stick, released ones forget.
+    """The state in another active set: new contactors stick, released ones are reset.
 
     Args:
         state: of the contactors.
@@ -186,7 +186,7 @@ def come_and_go(state: FrictionState, before: Bools, now: Bools, frictional: Boo
 
 
 def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
-    """The state in which contactors ``which (n,)`` slip along ``q (n, gdim)``."""
+    """The state with slip of contactors ``which (n,)`` along ``q (n, gdim)``."""
     size = np.linalg.norm(q, axis=1)
     i = which & (size > 0)
     direction = np.where(i[:, None], q / np.where(i, size, 1.0)[:, None], state.direction)
@@ -194,17 +194,16 @@ def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
 
 
 def slip_stiffness(own: Array, row: Ints, weight: Array, followed: Array) -> Array:
-    """Stiffness c of contactors that slip in space ``(n,)``.
+    """Stiffness c of slipping contactors in 3D ``(n,)``.
 
-    The contactor and what it follows resist a relative motion one behind the other: ``1 / k = 1 / k_i + sum_a N_a^2 / k_a``, with the
-    diagonal of K for the stiffness at each node. That of a contactor alone, were it much stiffer than its target, would turn the slip
-    by far less than it turns.
+    The contactor and the followed nodes are springs in series: ``1 / k = 1 / k_i + sum_a N_a^2 / k_a``, with the diagonal of K as
+    stiffness of each node. The stiffness of a much stiffer contactor alone would underestimate the rotation of the slip direction.
 
     Args:
         own: diagonal of K at the contactors ``(n,)``.
         row: contactor of each term ``(k,)``.
-        weight: by which it follows a node ``(k,)``.
-        followed: diagonal of K there ``(k,)``; zero where nothing is known.
+        weight: weight of the followed node ``(k,)``.
+        followed: diagonal of K there ``(k,)``; zero if not known.
     """
     seen = (followed > 0) & (own[row] > 0)
     there = np.bincount(row[seen], weight[seen] ** 2 * own[row[seen]] / followed[seen], len(own))
@@ -212,7 +211,7 @@ def slip_stiffness(own: Array, row: Ints, weight: Array, followed: Array) -> Arr
 
 
 def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:
-    """What holds the direction of slip back: a stiffness across it, and the part of the force across it that is taken away ``(k,)``.
+    """Linearisation of the slip direction: a stiffness across it, and the part of the force across it that is removed ``(k,)``.
 
     With ``a = bound / |q|`` these are ``c a / (1 - a)`` and ``a / (1 - a)``.
 
@@ -226,16 +225,16 @@ def turn_stiffness(size: Array, bound: Array, c: Array) -> tuple[Array, Array]:
 
 
 def work(before: Array, now: Array, start: Array, end: Array, cornered: Bools) -> Array:
-    """What friction takes from the bodies over a step ``(n,)``: the mean of its forces over the way along the target.
+    """Frictional dissipation of a step ``(n,)``: mean of the friction forces at start and end times the slip.
 
-    Into a corner a contactor slides before the corner holds it; force that would push it on there is none of the way's friction.
+    A contactor slides into a corner before it is held there; work of a force that would push it further does not count as friction.
 
     Args:
         before: friction at the start of the step ``(n, gdim)``.
         now: at its end ``(n, gdim)``.
-        start: relative motion in the step, past what friction at its start acts on ``(n, gdim)``.
-        end: past what it acts on at its end ``(n, gdim)``.
-        cornered: contactors that a corner holds at the end ``(n,)``.
+        start: relative motion in the step, for the weights at its start ``(n, gdim)``.
+        end: the same for the weights at its end ``(n, gdim)``.
+        cornered: contactors held in a corner at the end ``(n,)``.
     """
     first, last = (-0.5 * np.einsum("ng,ng->n", tau, way) for tau, way in ((before, start), (now, end)))
     return np.asarray(first + np.where(cornered, np.maximum(last, 0.0), last))

@@ -1,4 +1,4 @@
-"""What a contact is looked at for while steps are taken, and warns of once."""
+"""Checks of contacts after every step, with warnings given once."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 
 class WatchedContact(ContactResults):
-    """A contact of a problem, whose ends, corners and wear are looked at after every step.
+    """A contact of a problem, with checks of ends, corners and wear after every step.
 
     Attributes:
-        adjust: whether gaps at the start have been closed, and how far.
+        adjust: whether initial gaps have been closed, or up to which length.
         tied: whether contactors are tied from the start, or ``"after"``.
         target: facets, or a rigid surface.
     """
@@ -41,14 +41,14 @@ class WatchedContact(ContactResults):
     _offsets: Offsets | None
 
     def begin(self) -> None:
-        """Take the contact for that of a problem that is complete (collective)."""
+        """Begin the checks, when the problem is complete (collective)."""
         self.taken, self._slipped, self._on = True, False, True
-        #: A convex corner of the target by which the contact has lacked force.
+        #: The reported convex corner of the target, which reduces the contact force.
         self._corner: CornerInside | None = None
         self._off_at_start = self.pair.off.copy()
 
     def take_pair(self, pair: Interface) -> None:
-        """Take another interface for the contact's."""
+        """Replace the interface of the contact."""
         self._pair = pair
         if self._offsets is not None:
             self._offsets.pair = pair
@@ -59,16 +59,16 @@ class WatchedContact(ContactResults):
         return self._on
 
     def switch(self, on: bool) -> None:
-        """Switch it on or off; its pair is the caller's."""
+        """Switch it on or off; the caller changes its pair."""
         self._on = on
 
     @property
     def sees_corners(self) -> bool:
-        """Whether convex corners of the target may enter facets between contactors."""
+        """Whether convex corners of the target may penetrate facets between contactors."""
         return self.pair.discretisation.at_feet and self.contactor.dim > 0
 
     def edges_that_meet(self) -> Meeting | None:
-        """Surfaces whose sharp edges may cross, in 3D; the same two of contacts that have them together (collective)."""
+        """Surfaces whose sharp edges may cross, in 3D; contacts with the same surfaces share them (collective)."""
         from uem_dolfinx.contact.warnings.edges_inside import Meeting
 
         if self.contactor.dim < 2 or self.tied is True or not isinstance(self.target, Tag):
@@ -76,22 +76,22 @@ class WatchedContact(ContactResults):
         try:
             return Meeting(facets_of(self.config, self.contactor, "contactor"), facets_of(self.config, self.target))
         except OrientationError:
-            # a surface inside a body has no outside which an edge could come from
+            # a surface inside a body has no outer side from which an edge could enter
             return None
 
     @property
     def corner(self) -> CornerInside | None:
-        """A convex corner of the target by which the contact has lacked force, once one has been told of."""
+        """The reported convex corner of the target, which reduces the contact force; None without one."""
         return self._corner
 
     def note_corner(self, corner: CornerInside) -> None:
-        """Tell of a convex corner of the target by which the contact lacks force."""
+        """Warn of a convex corner of the target that reduces the contact force."""
         self._corner = corner
         logger.warning("%s: %s", self.name, corner)
 
     @property
     def watches_ends(self) -> bool:
-        """Whether contactors that slide off the target's end are still to be told of."""
+        """Whether a warning of contactors that slide off the target's end is still possible."""
         return not self._slipped and self.pair.target.n_nodes > 0
 
     @property
@@ -100,22 +100,22 @@ class WatchedContact(ContactResults):
         return self._off_at_start
 
     def warn_of_ends(self) -> None:
-        """Tell that contactors have slid off the target's end, if they are many (collective)."""
+        """Warn if many contactors have slid off the target's end (collective)."""
         self._slipped = warn_of_slipped(self.pair, self._off_at_start | self.pair.tied, self._areas)
 
     def look_at_wear(self, before: PairState | None, stiffness: Array | None) -> None:
-        """Warn, once, if the step from the state ``before`` has worn too much; ``stiffness`` as of ``Watch.look`` (collective)."""
+        """Warn, once, of too much wear in the step from the state ``before``; ``stiffness`` as in ``Watch.look`` (collective)."""
         wear = None if self.pair.friction is None else self.pair.friction.wear
         if wear is not None and before is not None and stiffness is not None:
             wear.look_at_step(before, self.pair.committed, self.pair.kinematics.normal, stiffness)
 
 
 class Watch:
-    """The contacts of a problem that is complete, looked at together after every step (collective).
+    """Joint checks of all contacts of a complete problem after every step (collective).
 
     Args:
         contacts: of the problem, which have begun.
-        equations: of users.
+        equations: equations of users.
     """
 
     def __init__(self, contacts: Sequence[WatchedContact], equations: Sequence[Any] = ()):
@@ -149,7 +149,7 @@ class Watch:
         self._edges = [(one, group) for one, group in edges if one.any]
 
     def begin(self) -> None:
-        """Begin with the interfaces that contacts have now, or go on with them (collective)."""
+        """Begin or continue with the present interfaces of contacts (collective)."""
         from uem_dolfinx.contact.warnings.target_corners import TargetCorners
 
         forces = {id(c): f for corners, group in self._corners.values() for c, f in zip(group, corners.largest)}
@@ -163,11 +163,11 @@ class Watch:
         self._off_at_start = {key: np.concatenate([own[id(m)] for m in whole.members]) for key, whole in wholes.items()}
 
     def look(self, before: Mapping[int, PairState], stiffness: Array | None) -> None:
-        """Look at contacts that are on after a step (collective).
+        """Check contacts that are switched on, after a step (collective).
 
         Args:
-            before: states from which the step led, by ``id`` of interfaces that are treated alone.
-            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``; None where it is not known yet.
+            before: states at the start of the step, by ``id`` of the single interfaces.
+            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``; None before it is known.
         """
         looked_at = [c for c in self._contacts if c.on and not c.pair.far]
         for group in _by_interface(looked_at).values():
@@ -180,7 +180,7 @@ class Watch:
     def _look_at_edges(self) -> None:
         """Warn of sharp edges that cross, once for each contact and step (collective)."""
         for edges, group in self._edges:
-            # edges may be near where no contactor is
+            # edges may be near each other without a contactor nearby
             looked_at = [c for c in group if c.on]
             found = edges.find() if looked_at else None
             if found is not None:
@@ -189,7 +189,7 @@ class Watch:
                 warn(looked_at[0].name, found)
 
     def _look_at_ends(self, group: Sequence[WatchedContact]) -> None:
-        """Warn of contactors that have slid off the ends of targets, of contacts that are treated together (collective)."""
+        """Warn of contactors that have slid off the ends of targets, for contacts treated together (collective)."""
         group = [c for c in group if c.watches_ends]
         if not group:
             return
@@ -202,12 +202,12 @@ class Watch:
                 contact.warn_of_ends()
 
     def _look_at_corners(self, contacts: Sequence[WatchedContact], stiffness: Array | None) -> None:
-        """Note and warn of a convex corner of a target inside the contactor, once for each contact (collective)."""
+        """Store and warn of a convex target corner inside the contactor, once for each contact (collective)."""
         for contact, corner in self.corners_inside(contacts, stiffness).items():
             contact.note_corner(corner)
 
     def corners_inside(self, contacts: Sequence[WatchedContact], stiffness: Array | None) -> dict[WatchedContact, CornerInside]:
-        """Convex corners of targets inside contactors by which contacts lack force; ``stiffness`` as of ``look`` (collective)."""
+        """Convex target corners inside contactors that reduce contact forces; ``stiffness`` as in ``look`` (collective)."""
         if stiffness is None:
             return {}
         found: dict[WatchedContact, CornerInside] = {}
@@ -218,9 +218,9 @@ class Watch:
         return found
 
     def name_corner(self, stiffness: Array | None, error: UEMError) -> None:
-        """Tell in an error of a convex corner of a target inside contactors, if there is one (collective).
+        """Add a convex target corner inside contactors to an error message, if there is one (collective).
 
-        A corner by which a contact lacks force, or lacked it before; ``stiffness`` as of ``look``.
+        The corner reduces a contact force now or did so before; ``stiffness`` as in ``look``.
         """
         now = self.corners_inside([c for c in self._contacts if c.on], stiffness)
         for contact in self._contacts:
@@ -231,7 +231,7 @@ class Watch:
 
 
 def _warn_of_sagging_facets(group: Sequence[WatchedContact]) -> None:
-    """Warn of targets too coarse for their contactors, of contacts that are treated together (collective)."""
+    """Warn of targets too coarse for their contactors, for contacts treated together (collective)."""
     whole = group[0].pair.whole
     some = np.ones(len(whole.members), dtype=bool)
     if len(some) > 1:
@@ -244,7 +244,7 @@ def _warn_of_sagging_facets(group: Sequence[WatchedContact]) -> None:
 
 
 def _by_interface(contacts: Sequence[WatchedContact]) -> dict[int, list[WatchedContact]]:
-    """Contacts by ``id`` of what they are treated as."""
+    """Contacts by ``id`` of their joint interface."""
     groups: dict[int, list[WatchedContact]] = {}
     for contact in contacts:
         groups.setdefault(id(contact.pair.whole), []).append(contact)
