@@ -1,14 +1,14 @@
-"""Multigrid that sees contactors much stiffer than their targets: what it cannot see is solved exactly.
+"""Deflation for multigrid with contactors much stiffer than their targets: a small part of the problem is solved exactly.
 
-P lands the stiffness of a contactor on the nodes that it follows, as pieces of low rank. Where it outweighs the target's own, what the
-target can still do between them oscillates, and no coarser grid shows it; nor does one show that a stiff body moves as a whole. So both
-are taken out of multigrid's hands: with W, whose columns are the unknowns of these nodes and their neighbours and the rigid motions of
-the stiff bodies, and B a multigrid cycle,
+P adds the stiffness of a contactor to the nodes that it follows, as terms of low rank. If it exceeds the target's own stiffness, the
+remaining modes of the target oscillate and have no coarse-grid representation; nor has the rigid motion of a stiff body. Both are deflated:
+with W, whose columns are the unknowns of these nodes and their neighbours and the rigid motions of the stiff bodies, and B a multigrid
+cycle,
 
     M^-1 = C + (1 - C A) B (1 - A C),    C = W (W'AW)^-1 W'
 
-B does not see the nodes that are pressed on at all: the largest eigenvalues that their pieces have would set the bounds of Chebyshev's
-smoother for the whole of both bodies.
+B excludes the target nodes completely, because the largest eigenvalues of the added terms would set the bounds of Chebyshev's smoother
+for both bodies.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from uem_dolfinx.parallel import gathered, reduced
 #: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
 #: [convention; diagonals of P'KP and K; test_deflation.py::test_much_stiffer_contactors_are_found]
 MUCH_STIFFER = 10.0
-#: Types of PC that cannot see contactors much stiffer than their targets.
+#: Types of PC that need deflation for contactors much stiffer than their targets.
 MULTIGRID = ("hypre", "gamg", "ml")
 #: Up to so many bodies each have rigid-body modes of their own in the near-null space.
 #: [convention; bodies; test_linear_solver.py::test_few_bodies_have_modes_of_their_own]
@@ -45,10 +45,10 @@ PLENTY = 200
 
 
 class Deflation:
-    """A preconditioner of PETSc's Python type around another one.
+    """A deflated preconditioner, of PETSc's Python type.
 
     Args:
-        inner: preconditioner that cannot see stiff contactors.
+        inner: preconditioner that needs deflation.
     """
 
     def __init__(self, inner: PETSc.PC):
@@ -71,7 +71,7 @@ class Deflation:
             pc.setType("redundant")
 
     def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802
-        """Set up what PETSc has not (collective)."""
+        """Set up the inner preconditioner (collective)."""
         self.inner.setUp()
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -91,7 +91,7 @@ class Deflation:
 
 @timed("deflation")
 def in_deflation(pc: PETSc.PC, space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.PC:
-    """A preconditioner of A with multigrid ``pc`` inside, which does not see nodes ``pressed (n_owned,)`` by stiff bodies (collective)."""
+    """Deflated preconditioner of A with multigrid ``pc``, which excludes nodes ``pressed (n_owned,)`` by stiff bodies (collective)."""
     pc.setOperators(without(space, A, P, pressed))
     deflation = Deflation(pc)
     deflation.update(A, deflated(space, A, P, pressed))
@@ -100,7 +100,7 @@ def in_deflation(pc: PETSc.PC, space: Nodes, A: PETSc.Mat, P: Restriction, press
 
 @timed("deflation")
 def pressed_hard(space: Nodes, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
-    """Owned nodes whose stiffness is mostly that of contactors that follow them ``(n_owned,)``."""
+    """Mask of owned nodes whose stiffness is mostly due to contactors that follow them ``(n_owned,)``."""
     followed = np.zeros(space.n_owned, dtype=bool)
     followed[P.followed_here] = True
     followed[P.nodes] = False
@@ -157,7 +157,7 @@ def _rigid_modes(space: Nodes, P: Restriction, pressed: Bools, where: Bools) -> 
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
     mine = np.flatnonzero(stiff[body[:n]])
     number = (np.cumsum(stiff) - 1)[body[mine]]
-    # lengths of the model's size make turns as large as shifts
+    # in units of the model's size, rotations are as large as translations
     motions = space.modes(centred=True).transpose(1, 0, 2)
     modes = np.stack([P.reduce(space.vector(v)).array_r.reshape(n, -1) for v in motions], axis=2)
     modes = (modes * where[:, :, None])[mine]
@@ -176,8 +176,8 @@ def _rigid_modes(space: Nodes, P: Restriction, pressed: Bools, where: Bools) -> 
 def near_null_space(space: Nodes, A: PETSc.Mat, restriction: Restriction) -> PETSc.NullSpace:
     """Rigid-body modes in the unknowns q: at a contactor their tangential components only.
 
-    Bodies in contact may still slide along each other; a few of them get modes of their own, or aggregates that reach
-    across a contact would lock its sliding. Among other fields they are of the displacement's unknowns alone.
+    Bodies in contact may still slide along each other. If they are few, each gets its own modes, since aggregates across a contact
+    would lock its sliding. In mixed problems the modes contain the displacement's unknowns only.
     """
     nodes: Nodes = getattr(space, "config", space)
     body, n_bodies = find_bodies(nodes)
@@ -192,7 +192,7 @@ def near_null_space(space: Nodes, A: PETSc.Mat, restriction: Restriction) -> PET
         if space.mixed:
             q = PETSc.Vec().createWithArray(np.array(q.array_r[:n]), comm=space.comm)
         before = q.norm()
-        # twice is enough
+        # orthogonalised twice, against rounding
         for other in [*vectors, *vectors]:
             q.axpy(-q.dot(other), other)
         if q.norm() > INDEPENDENT * before:

@@ -1,4 +1,4 @@
-"""Uniting equations as data: all that the algebra knows of contact.
+"""Constraint ("uniting") equations as data, the only interface between contact and algebra.
 
 [UEM] is Farahani, Mofid, Vafai (2001).
 """
@@ -31,10 +31,10 @@ class UnitingEquations:
 
     Attributes:
         node: local number of the owned node whose displacement is eliminated ``(m,)``.
-        direction: vectors ``(m, block)``, of unit length where a contactor follows its target.
+        direction: vectors ``(m, block)``, of unit length if a contactor follows its target.
         gap: lengths ``(m,)``.
-        active: whether the equation holds ``(m,)``; one that does not only keeps its place in the sparsity of P, so that
-            contactors can be activated and released without new symbolic work.
+        active: mask of active equations ``(m,)``; inactive ones only keep their entries in the sparsity of P, so that contactors can
+            be activated and released without new symbolic factorisations.
         row: the equation that each term belongs to ``(k,)``.
         followed: global block number of the node that the term follows ``(k,)``.
         coefficients: of its displacement ``(k, block)``.
@@ -55,7 +55,7 @@ class UnitingEquations:
     def along(node: Indices, direction: Array, targets: Ints, weights: Array, gap: Array, active: Bools) -> UnitingEquations:
         """Equations whose terms all have one direction: ``direction . (du_node - sum_a weights_a du_a) = -gap``.
 
-        ``targets (m, nn)`` are the global block numbers of the nodes followed, -1 for none, with ``weights (m, nn)``.
+        ``targets (m, nn)`` are the global block numbers of the followed nodes, -1 if missing, with ``weights (m, nn)``.
         """
         row, a = np.nonzero(targets >= 0)
         coefficients = weights[row, a][:, None] * direction[row]
@@ -74,14 +74,14 @@ class UnitingEquations:
         return UnitingEquations(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(UnitingEquations)))
 
     def select(self, which: Bools) -> UnitingEquations:
-        """Some of the equations, in their order ``(m,)``."""
+        """The equations in a mask ``(m,)``, in the same order."""
         place, terms = np.cumsum(which) - 1, which[self.row]
         kept: list[Any] = [v[which] for v in (self.node, self.direction, self.gap, self.active)]
         kept += [place[self.row[terms]].astype(np.int64), self.followed[terms], self.coefficients[terms]]
         return UnitingEquations(*kept)
 
     def forces(self, multipliers: Array) -> Array:
-        """Forces with which they act by their multipliers ``(m,)``, on their own nodes, then on those followed ``(m + k, block)``."""
+        """Forces by multipliers ``(m,)`` on the equations' own nodes, then on the followed nodes ``(m + k, block)``."""
         return np.concatenate([multipliers[:, None] * self.direction, -multipliers[self.row, None] * self.coefficients])
 
     def by_node(self) -> Iterator[tuple[Indices, Ints]]:
@@ -94,7 +94,7 @@ class UnitingEquations:
 
 
 def least_left(A: Array) -> Array:
-    """What nodes have left to eliminate by k equations each with directions ``A (n, k, block)``, the least singular value ``(n,)``."""
+    """Smallest singular values ``(n,)`` of the directions ``A (n, k, block)`` of k equations at each node, in free components."""
     if A.shape[1] > A.shape[2]:
         return np.zeros(len(A))
     if A.shape[1] == 1:
@@ -103,7 +103,7 @@ def least_left(A: Array) -> Array:
 
 
 def send(comm: MPI.Comm, equations: UnitingEquations, rank: Ints) -> tuple[UnitingEquations, Exchange]:
-    """The equations of global nodes that all ranks send here, each to one ``rank (m,)``, with their terms (collective)."""
+    """Send equations of global nodes, each to one ``rank (m,)``, with their terms; returns the received ones (collective)."""
     exchange, order = Exchange.to(comm, rank), np.argsort(equations.row, kind="stable")
     node, direction, gap, active, n_terms = exchange.send(
         equations.node.astype(np.int64), equations.direction, equations.gap, equations.active,

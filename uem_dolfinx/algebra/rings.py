@@ -1,13 +1,13 @@
-"""Uniting equations that follow each other in rings, closed: pure algebra, for equations of any origin.
+"""Closure of constraint equations that follow each other in rings: pure algebra, for equations of any origin.
 
-Three bodies that meet in a point may each be the target of the next: every equation follows what another one eliminates. Equations
-``A du = C du - gap`` that eliminate ``L``, with ``A L = 1``, follow each other by ``M = C L``. Those of one ring, which are strongly
-connected by M, are solved for what they eliminate,
+Of three bodies that meet in a point, each may be the target of the next, so that every equation contains a component that another one
+eliminates. Equations ``A du = C du - gap`` that eliminate ``L``, with ``A L = 1``, follow each other by ``M = C L``. The equations of one
+ring, strongly connected by M, are solved for their eliminated components,
 
     A du = W C (1 - L A) du - W gap,    W = (1 - M)^-1
 
-and follow each other no more. Forces of the given equations are ``W'`` times those of the closed ones. Where W is large they depend
-on each other, and have to be made independent first.
+and then no longer follow each other. Forces of the given equations are ``W'`` times the forces of the closed ones. If W is large, the
+equations depend on each other and must be made independent first.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ class DependentRingError(ConflictError):
     """Equations that follow each other in a ring and depend on each other.
 
     Attributes:
-        rows: which of the equations of this rank they are ``(m,)``.
+        rows: mask of these equations on this rank ``(m,)``.
     """
 
     rows: Bools
 
 
 def components(comm: MPI.Comm, links: Ints, mine: Ints, strong: bool) -> tuple[Ints, Ints]:
-    """Connected components of a graph that is spread over ranks, and a rank for each (collective).
+    """Connected components of a distributed graph, and a rank for each (collective).
 
     Args:
         comm: communicator.
-        links: pairs of numbers ``(k, 2)`` of which the first leads to the second, those that this rank knows.
-        mine: numbers of this rank ``(m,)``, of which the rank that has most of a component takes it.
-        strong: whether ways must lead from each to each.
+        links: edges of this rank, pairs of numbers ``(k, 2)`` from the first to the second.
+        mine: numbers owned by this rank ``(m,)``; a component is assigned to the rank that owns most of it.
+        strong: whether components are strongly connected.
 
     Returns:
-        The component of each of ``mine``, -1 for those in no link, and the ranks of all components.
+        The component of each of ``mine``, -1 for numbers without edges, and the ranks of all components.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -75,10 +75,10 @@ def components(comm: MPI.Comm, links: Ints, mine: Ints, strong: bool) -> tuple[I
 
 
 def in_rings(parts: PETSc.Mat) -> tuple[Ints, Ints]:
-    """The ring of each of this rank's equations ``(m,)``, -1 for none, and the rank that closes each ring (collective).
+    """The ring of each of this rank's equations ``(m,)``, -1 if in no ring, and the rank that closes each ring (collective).
 
     Args:
-        parts: by which an equation, its row, follows another one, its column, positive ``(m, m)``.
+        parts: magnitudes of the coefficients with which equations (rows) follow others (columns) ``(m, m)``.
     """
     comm, (first, end) = parts.comm.tompi4py(), parts.getOwnershipRange()
     follows = parts.copy()
@@ -88,7 +88,7 @@ def in_rings(parts: PETSc.Mat) -> tuple[Ints, Ints]:
     core = follows.createVecRight()
     core.set(1.0)
     left, before = core.sum(), np.inf
-    # what follows nothing of the rest is in no ring, nor is what nothing of the rest follows
+    # equations that follow no other remaining one, or that no other remaining one follows, are in no ring
     while 0.0 < left < before:
         ways = (follows * core).array_r * core.array_r
         core.array[:] = ways > 0
@@ -109,7 +109,7 @@ def in_rings(parts: PETSc.Mat) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True)
 class _Closed:
-    """One ring on the rank that closes it: its equations' numbers there, ``1 - M`` factorised, and the closed equations."""
+    """One ring on the rank that closes it: its equations' numbers there, the factorised ``1 - M``, and the closed equations."""
 
     rows: Ints
     factor: Any
@@ -117,16 +117,16 @@ class _Closed:
 
 
 class Rings:
-    """Closed equations in place of those that follow each other in rings (collective).
+    """Closed equations in place of equations that follow each other in rings (collective).
 
     Args:
         space: the nodes whose components are restricted.
         equations: of this rank.
-        lift: how each acts on its node ``(m, block)``.
-        parts: by which an equation, its row, follows another one, its column, positive ``(m, m)``.
+        lift: action of each equation on its node ``(m, block)``.
+        parts: magnitudes of the coefficients with which equations (rows) follow others (columns) ``(m, m)``.
 
     Attributes:
-        equations: in the order of those that are given.
+        equations: in the order of the given ones.
 
     Raises:
         DependentRingError: if equations of a ring depend on each other.
@@ -150,7 +150,7 @@ class Rings:
         self.equations = _replaced(equations, solved, at)
 
     def _check(self, space: Nodes, equations: UnitingEquations, bad: Bools) -> None:
-        """Raise if any equations here are of rings that could not be closed (collective)."""
+        """Raise if any equations on any rank are in rings that could not be closed (collective)."""
         dependent, error = np.zeros(len(equations), dtype=bool), None
         (dependent[self._mine[self._exchange.rows]],) = self._exchange.back(bad)
         if dependent.any():
@@ -166,7 +166,7 @@ class Rings:
             raise
 
     def forces(self, multipliers: Array, back: bool = False) -> Array:
-        """Forces of the given equations ``(m,)`` from those of the closed ones, or the transpose of this map (collective)."""
+        """Forces of the given equations ``(m,)`` from the forces of the closed ones, or the transpose of this map (collective)."""
         (mu,) = self._exchange.send(multipliers[self._mine])
         lam = np.zeros(len(mu))
         for ring in self._rings:
@@ -177,7 +177,7 @@ class Rings:
 
 
 def _close(there: UnitingEquations, lift: Array, rows: Ints) -> _Closed | None:
-    """A ring of equations ``rows`` of global nodes, closed; None if they depend on each other."""
+    """Close a ring of equations ``rows`` of global nodes; None if they depend on each other."""
     from scipy.sparse import csr_matrix, identity
     from scipy.sparse.linalg import LinearOperator, onenormest, splu
 
@@ -215,7 +215,7 @@ def _close(there: UnitingEquations, lift: Array, rows: Ints) -> _Closed | None:
 
 
 def _replaced(equations: UnitingEquations, solved: UnitingEquations, at: Ints) -> UnitingEquations:
-    """The equations with others in the places ``at (k,)``, of the same components."""
+    """The equations with those at positions ``at (k,)`` replaced by others of the same components."""
     gap, stays = equations.gap.copy(), np.ones(len(equations), dtype=bool)
     gap[at], stays[at] = solved.gap, False
     terms = stays[equations.row]

@@ -111,11 +111,11 @@ class Equation(given.Sealed):
         return [where for where, _ in self._terms]
 
     def n_values(self, block: int) -> int:
-        """As of ``LinearEquations``."""
+        """See ``LinearEquations``."""
         return 1
 
     def rows(self, config: Configuration, role: str) -> GivenRows:
-        """As of ``LinearEquations``."""
+        """See ``LinearEquations``."""
         found, many = [], []
         for i, (where, c) in enumerate(self._terms):
             with agreed(config.comm):
@@ -157,11 +157,11 @@ class Periodic(given.Sealed):
         self.b = checked_value("jump", jump, None)
 
     def n_values(self, block: int) -> int:
-        """As of ``LinearEquations``."""
+        """See ``LinearEquations``."""
         return block
 
     def rows(self, config: Configuration, role: str) -> GivenRows:
-        """As of ``LinearEquations``."""
+        """See ``LinearEquations``."""
         g, turn = config.block, self._turn
         with agreed(config.comm):
             if turn is not None and len(turn) != config.gdim:

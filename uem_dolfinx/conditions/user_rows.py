@@ -122,7 +122,7 @@ class JoinedRows:
 
     @property
     def turns(self) -> list[Any]:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         return [one.turns for one in self.each]
 
     @turns.setter
@@ -132,60 +132,60 @@ class JoinedRows:
 
     @property
     def rigid(self) -> JoinedRows | None:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         return self if self.each else None
 
     @property
     def n_rows(self) -> int:
-        """As of ``RigidNodes``."""
+        """See ``RigidNodes``."""
         return sum(len(one.equations) for one in self.each)
 
     def left(self, free: Bools) -> Bools:
-        """As of ``RigidNodes``."""
+        """See ``RigidNodes``."""
         left = free.copy()
         for one in self.each:
             left[one.set.nodes] &= ~one.eliminated
         return left
 
     def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
-        """As of ``RigidNodes``."""
+        """See ``RigidNodes``."""
         for one in self.each:
             equations = one.rewritten(equations)
         return equations
 
     def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
-        """As of ``RigidNodes``."""
+        """See ``RigidNodes``."""
         # original equations act on the eliminated components directly
         forces = forces_of(self._config, equations, np.where(equations.active, lam, 0.0))
         parts = [np.where(one.eliminated, forces[one.set.nodes], 0.0).ravel() for one in self.each]
         return np.asarray(multipliers - np.concatenate(parts))
 
     def take_load(self, at: float) -> None:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         if self.linear is not None:
             self.linear.take_load(at)
         for one in self._couplings:
             one.take_load(at)
 
     def given_values(self) -> dict[str, Any]:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         return {} if self.linear is None else self.linear.given_values()
 
     def begin_step(self, start: Array, fraction: float) -> None:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         for one in (self.linear, *self.each):
             if one is not None:
                 one.begin_step(start, fraction)
 
     def place(self) -> None:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         if self.turning:
             for one in self.each:
                 one.place()
             self._config.whole.x.scatter_forward()
 
     def at_present(self) -> UnitingEquations:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         for one in (self.linear, *self.each):
             if one is not None:
                 one.at_present()
@@ -193,16 +193,16 @@ class JoinedRows:
         return self.equations
 
     def largest_gap_here(self) -> float:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         return max((one.largest_gap_here() for one in (self.linear, *self.each) if one is not None), default=0.0)
 
     def curvature(self) -> list[tuple[Ints, Array]]:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         parts = [one.curvature(forces) for one, forces in self._forces_of_each()] if self.turning else []
         return [part for part in parts if part is not None]
 
     def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         return [part for part in (one.added_mass(factor) for one in self.each) if part is not None]
 
     def _forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
@@ -214,7 +214,7 @@ class JoinedRows:
             start = end
 
     def settle(self, dynamics: Any) -> None:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         n, g = self._config.n_owned, self._config.gdim
         for one in (one for one in self.each if one.set.large):
             v, a = (f.x.array[: n * g].reshape(n, g).copy() for f in (dynamics.velocity, dynamics.acceleration))
@@ -222,7 +222,7 @@ class JoinedRows:
             dynamics.change_rates(v.ravel(), a.ravel())
 
     def check(self) -> None:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         if self.linear is not None:
             self.linear.check()
         for one, forces in self._forces_of_each():
@@ -230,7 +230,7 @@ class JoinedRows:
             one.coupling.read_reactions(forces)
 
     def forces(self, multipliers: Array) -> Array:
-        """As of ``UserRows``."""
+        """See ``UserRows``."""
         return forces_of(self._config, self.equations, multipliers)
 
 

@@ -1,6 +1,6 @@
-"""Quadrature points of chosen cells: values of expressions there, Functions that hold what is known only there, sums and means.
+"""Quadrature points of some cells: values of expressions, Functions of point values, sums and means.
 
-Laws with history compute on arrays with one row for each point.
+Laws with history use arrays with one row per point.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from uem_dolfinx.parallel import agree, reduced
 #: How far the points that stand for the centre of a reference cell are from it in each coordinate; it enters results squared.
 #: [convention; reference cell; test_thresholds_motion.py::test_points_beside_the_centre]
 BESIDE_CENTRE = 1e-4
-#: Their directions by dimension: sums of all coordinates and of products of two different ones vanish, but for that of the plane.
+#: Directions of these points by dimension: sums of coordinates, and in 3D of products of two different ones, vanish.
 DIRECTIONS = {2: [[1, 1], [-1, -1]], 3: [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]}
 
 
 def owned_cells(domain: Any, part: Part | None) -> Indices:
-    """Owned local cells ``(n_cells,)``, ascending, of a part as ``as_tag`` takes and refuses it, None for the whole mesh (collective)."""
+    """Owned local cells ``(n_cells,)``, ascending, of a part, see ``as_tag``, or of the whole mesh for None (collective)."""
     tdim = domain.topology.dim
     owned = domain.topology.index_map(tdim).size_local
     if part is None:
@@ -37,23 +37,23 @@ def owned_cells(domain: Any, part: Part | None) -> Indices:
 
 
 class QuadraturePoints:
-    """Points of one quadrature rule in some of the cells this rank owns; all methods work on these alone.
+    """Points of one quadrature rule in some owned cells; all methods use these cells only.
 
     Args:
         domain: the mesh.
         cells: local indices of owned cells ``(n_cells,)``.
-        degree: of the rule; 0 is the cells' centre, for use together with other rules. Points beside it stand for it: from one point,
-            FFCx takes gradients and Jacobians for constants of the cell and uses them at the points of the form's other rules.
+        degree: of the rule; 0 is the cells' centre, for use together with other rules. It is replaced by points close to the centre:
+            with a single point, FFCx treats gradients and Jacobians as constant in the cell, also at points of other rules.
 
     Attributes:
         points: on the reference cell, ``(n_points, tdim)``.
-        dx: UFL measure over *all* cells by this rule; Functions of this rule are zero outside of ``cells`` unless others write there.
-        volumes: that belong to the points, of whole circles if the mesh is axisymmetric, ``(n_cells, n_points)``.
+        dx: UFL measure over *all* cells by this rule; Functions of this rule are zero outside of ``cells`` unless written elsewhere.
+        volumes: of the points, of whole circles if the mesh is axisymmetric, ``(n_cells, n_points)``.
     """
 
     def __init__(self, domain: Any, cells: Indices, degree: int):
         self.mesh, self.cells, self.degree = domain, cells, degree
-        #: By the size of their values: the spaces made, and where the points are in them.
+        #: Function spaces by size of values, with the indices of the points in them.
         self._spaces: dict[int, tuple[fem.FunctionSpace, Indices]] = {}
         metadata: dict[str, Any] = {"quadrature_degree": degree}
         self.points, weights = forms.quadrature_rule(compat.cell_name(domain), degree)
@@ -69,7 +69,7 @@ class QuadraturePoints:
             self.volumes *= self.evaluate(self.compile(circumference(domain))).reshape(self.volumes.shape)
 
     def compile(self, expression: Any) -> fem.Expression:
-        """Prepare a scalar or vector UFL expression for ``evaluate``; once, as it takes a compiler."""
+        """Compile a scalar or vector UFL expression for ``evaluate``; to be done once."""
         with compiling("stresses at the quadrature points"):
             return compat.compile_expression(expression, self.points)
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 
 STRAINS = ("small", "green_lagrange")
-#: What is expected of a back stress.
+#: Expected values of kinematic hardening.
 SLOPE_OR_TABLE = given.Range("0 or a positive number, or a table", given.NOT_NEGATIVE.holds)
 #: Degrees of the quadrature of stress and of pressure, by the displacement's degree, on simplices and on tensor-product cells;
 #: 0 is the cell's centre.
@@ -46,61 +46,61 @@ class VonMises(given.Sealed):
 
         S = C : (E - E_p),    q(S - 2/3 kinematic_hardening E_p) <= yield_stress + hardening * peeq
 
-    ``update`` returns the stresses at the present displacement from the *committed* history, ``commit`` makes the outcome the
-    history; what iterates did in between counts as neither loading nor unloading [UEM, 3]. The form is
-    ``residual(v)``; its tangent is ``ufl.derivative(residual(v), u) + stiffness(du, v)``.
+    ``update`` computes the stresses at the present displacement from the *committed* history, ``commit`` stores the new history, so
+    that Newton iterates count as neither loading nor unloading [UEM, 3]. The form is ``residual(v)``; its tangent is
+    ``ufl.derivative(residual(v), u) + stiffness(du, v)``.
 
-    A number as ``kinematic_hardening`` is Prager's rule. A table stands for parallel layers that share the strain, each perfectly
-    plastic, with weights and yield stresses of their own [Besseling, Journal of Applied Mechanics 25 (1958) 529-536; Owen, Prakash and
-    Zienkiewicz, Computers and Structures 4 (1974) 1251-1267]; codes call it multilinear kinematic hardening, sublayer or overlay model.
-    In uniaxial tension the stress follows the table exactly, and in cycles Masing's rule: after a reversal the curve of first loading
-    twice as large, until a loop closes and the curve before it goes on. A table of one straight line is Prager's rule. Each of its
-    bends is a layer, with a history of its own.
+    A number as ``kinematic_hardening`` is Prager's rule. A table represents parallel, perfectly plastic layers with the same strain and
+    different weights and yield stresses [Besseling, Journal of Applied Mechanics 25 (1958) 529-536; Owen, Prakash and Zienkiewicz,
+    Computers and Structures 4 (1974) 1251-1267], also known as multilinear kinematic hardening, sublayer or overlay model. In uniaxial
+    tension the stress follows the table exactly, and in cycles Masing's rule: after a reversal the curve of first loading scaled by two,
+    until a loop closes and the previous curve continues. A table of one straight line is Prager's rule. Each bend of the table is a
+    layer with its own history.
 
-    Plastic flow keeps the volume, and cells that cannot follow it lock. But in plane stress the pressure, elastic in this law, is
-    therefore integrated by a rule of its own. With the error of the limit load of Prandtl's punch in plane strain, perfectly plastic
-    at a strain of 0.001 and pressed in by 0.03 of its width, on 8 linear or 4 quadratic cells beneath half of it:
+    Plastic flow is isochoric, so that some cells lock. Except in plane stress, the pressure, which is elastic in this law, is therefore
+    integrated by a separate rule. Errors of the limit load of Prandtl's punch in plane strain, perfectly plastic with a yield strain of
+    0.001 and an indentation of 0.03 of its width, on 8 linear or 4 quadratic cells beneath half of it:
 
     - degree 1 on quadrilaterals and hexahedra, 5.6 %: stress at 2 points per direction, pressure at the cell's centre, which is the
       B-bar method (Hughes, Int. J. Numer. Meth. Engng 15 (1980) 1413-1418); with the pressure at the stress's points it would be
-      35 % and grow with the load. Hexahedra that are no parallelepipeds then pass the patch test approximately: with nodes
-      moved by 10 % of a cell's size stresses err by 0.08 %, by 25 % 0.6 %. So do axisymmetric quadrilaterals that are no
-      parallelograms, by 0.3 % and 0.9 % beside the axis, where pressures are taken at the mean place of the cell's circles;
+      35 % and increase with the load. Hexahedra that are no parallelepipeds then pass the patch test approximately: with nodes
+      moved by 10 % of a cell's size the error of stresses is 0.08 %, by 25 % 0.6 %; for axisymmetric quadrilaterals that are no
+      parallelograms 0.3 % and 0.9 % next to the axis, where pressures are taken at the mean position of the cell's circles;
     - degree 2 on quadrilaterals and hexahedra, 4.2 %: stress at 3 points per direction, pressure at 2; with both at 3 it
       would be 12 %;
     - degree 2 on triangles and tetrahedra, 7.0 %: both by the rule of degree 2, as a single point for the pressure leaves the
       tangent singular;
-    - degree 1 on triangles and tetrahedra, 24 % and growing: one point. These cells **lock**, use one of the others.
+    - degree 1 on triangles and tetrahedra, 24 % and increasing: one point. These cells **lock**; use other cells.
 
     Plane stress does not lock with any cell.
 
     Args:
-        u: displacement, a Function of a vector Lagrange space; with ``displacement`` a Function of a mixed space, as the problem's.
+        u: displacement, a Function of a vector Lagrange space; with ``displacement`` a Function of a mixed space, as in the problem.
         E: Young's modulus: a number or a DG0 Function, as the other parameters; read once.
         nu: Poisson's ratio.
         yield_stress: in uniaxial tension; infinite where the body is elastic.
-        hardening: increase of the yield stress per equivalent plastic strain; 0 is none.
-        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none. Or a table: pairs (plastic
-            strain, back stress in uniaxial tension) from (0, 0), with straight lines between, whose slopes do not rise, and a constant
-            beyond the last; then ``hardening`` is 0, and in plane stress ``nu`` below 1/2.
-        displacement: number of the part of the mixed space that is the displacement.
-        kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh that has been declared so.
+        hardening: increase of the yield stress per equivalent plastic strain.
+        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain. Or a table: pairs (plastic strain, back
+            stress in uniaxial tension) from (0, 0), with linear interpolation, slopes that do not increase, and a constant beyond the
+            last pair; then ``hardening`` must be 0, and in plane stress ``nu`` below 1/2.
+        displacement: number of the displacement's part of the mixed space.
+        kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh declared axisymmetric.
         strain: ``"small"``: symmetric gradient and Cauchy stress, or ``"green_lagrange"``: additive split of the Green-Lagrange
             strain, with the second Piola-Kirchhoff stress in the yield surface; for large rotations and moderate strains.
-        cells: those made of this material, a tag or as ``Contact`` takes surfaces; may be none on some ranks. None is all cells.
-        quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
+        cells: cells of this material, a tag or as surfaces in ``Contact``; may be empty on some ranks. None is all cells.
+        quadrature_degree: of the stress; None chooses by cell and degree. The degree of the pressure is not larger.
 
     Attributes:
-        stress, plastic_strain, peeq: at quadrature points, with the components of ``Returned``; ``stress`` as of the last
-            ``update``, the others committed; zero outside of ``cells``. With a table those of the layers, one after another
-            (in plane stress with the components of plane strain); ``cell_averages`` give those of the body, by the layers' weights.
-        history: the committed Functions by name, all that the material remembers.
+        stress, plastic_strain, peeq: at quadrature points, with the components of ``Returned``; ``stress`` from the last ``update``,
+            the others committed; zero outside of ``cells``. With a table values of all layers, one after another (in plane stress
+            with the components of plane strain); ``cell_averages`` are weighted means over the layers.
+        history: the committed Functions by name, the complete history.
         handed: parameters as passed, by name.
 
     Raises:
         InputError, InputTypeError: for an unknown word, a parameter out of its range, or isotropic hardening together with a table.
-        SpaceError: if ``u`` is no displacement in a Lagrange space of degree 1 or 2, or the mesh of ``cells`` is another.
-        TagError: if ``cells`` are not cells, or none on any rank.
+        SpaceError: if ``u`` is no displacement in a Lagrange space of degree 1 or 2, or if ``cells`` are of another mesh.
+        TagError: if ``cells`` are not cells, or empty on all ranks.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class VonMises(given.Sealed):
         degrees = self._degrees(degree, quadrature_degree)
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
         self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
-        #: Yield stress over peeq; of layers where a table is handed over, which then are all that hardens.
+        #: Yield stress over peeq; with a table, the yield curve of the layers.
         self._curve: YieldCurve
         self._layers: Layers | None = None
         self._read_parameters(E, nu, yield_stress, hardening, kinematic_hardening)
@@ -143,7 +143,7 @@ class VonMises(given.Sealed):
         self.update()
 
     def _compile(self) -> None:
-        """Prepare the strain at the points of stress, and its trace at those of pressure."""
+        """Compile the strain at the stress points, and its trace at the pressure points."""
         self._strain = self._points.compile(self._vector(self._lagrangian(self._moved)))
         self._volume_change = self._pressure_points.compile(self._dilatation(self._lagrangian(self._moved)))
 
@@ -170,7 +170,7 @@ class VonMises(given.Sealed):
         cell = compat.cell_name(self.mesh)
         simplex = cell in ("triangle", "tetrahedron")
         affine = simplex and compat.geometry_dofs(self.mesh).shape[1] == gdim + 1
-        # one point is for constant strains
+        # one point is sufficient for constant strains only
         lowest = 1 if affine and degree == 1 else 2
         if quadrature_degree is not None and given.count("quadrature_degree", quadrature_degree) < lowest:
             expected = f"expected {lowest} or more for degree {degree} on {cell} cells"
@@ -180,7 +180,7 @@ class VonMises(given.Sealed):
         return stress, min(stress, max(pressure, lowest) if simplex else pressure)
 
     def _read_parameters(self, E: Any, nu: Any, yield_stress: Any, hardening: Any, kinematic_hardening: Any) -> None:
-        """Take the parameters of every cell, and repeat them for its points."""
+        """Read the parameters of every cell, and repeat them for its points."""
         from uem_dolfinx.materials.hardening import is_table
 
         layered, count = is_table(kinematic_hardening), len(self._points.points)
@@ -190,7 +190,7 @@ class VonMises(given.Sealed):
         self._mu = self._E / (2 * (1 + self._nu))
         self._bulk = np.zeros_like(E) if self.kind == "plane_stress" else E / (3 * (1 - 2 * nu))
         self._curve = self._read_curve(yield_stress, hardening)
-        #: Parameters at this rank's points, by name, each ``(n_points,)``; of tables their points.
+        #: Parameters at this rank's points, by name, each ``(n_points,)``; for tables their columns.
         self.parameters = {"E": self._E, "nu": self._nu, **self._curve.parameters}
         if layered:
             self._read_layers(kinematic_hardening)
@@ -207,7 +207,7 @@ class VonMises(given.Sealed):
         return Linear(first, self._pointwise("hardening", hardening, given.NOT_NEGATIVE))
 
     def _read_layers(self, points: Any) -> None:
-        """Take the layers that a table of back stresses stands for; they are all that hardens (collective)."""
+        """Make the layers of a table of back stresses, without isotropic hardening (collective)."""
         from uem_dolfinx.materials.hardening import Linear
         from uem_dolfinx.materials.layers import BackTable, Layers
 
@@ -227,9 +227,9 @@ class VonMises(given.Sealed):
         return np.repeat(self._points.of_cells(name, value, within), len(self._points.points))
 
     def _create_history(self) -> int:
-        """Stress and history at the quadrature points, zero outside of this material's cells: the number of the stress's components."""
+        """Make stress and history at the quadrature points, zero outside of the cells; returns the number of stress components."""
         size, at = {"3d": 6, "plane_strain": 4, "plane_stress": 3, "axisymmetric": 4}[self.kind], self._points
-        # layers in plane stress are not free of stress across it each
+        # in plane stress single layers have out-of-plane stresses
         layers, of_each = (1, size) if self._layers is None else (self._layers.count, max(size, 4))
         self.stress = at.create_function("stress", size)
         self.plastic_strain = at.create_function("plastic_strain", layers * of_each)
@@ -242,7 +242,7 @@ class VonMises(given.Sealed):
     def _create_functions(self) -> None:
         """Functions at the quadrature points, zero outside of this material's cells."""
         size, at = self._create_history(), self._points
-        # what the forms hold: the deviator where the pressure goes its own way, and the tangent
+        # Functions in the forms: the deviator, if the pressure is integrated separately, and the tangent
         self._s = self.stress if self.kind == "plane_stress" else at.create_function("deviator", size)
         self._a, self._c = at.create_function("a"), at.create_function("c")
         vectors = 1 if self._layers is None else self._layers.count + (self.kind == "plane_stress")
@@ -250,12 +250,12 @@ class VonMises(given.Sealed):
         self._own(self.stress, self._s, self._a, self._c, self._m, *self.history.values())
 
     def _own(self, *functions: fem.Function) -> None:
-        """Mark Functions as fields of this law, by which a problem that gets them in F knows that it needs it."""
+        """Mark Functions as fields of this law, so that a problem can check that the laws of all fields in F are given."""
         for f in functions:
             f.material = weakref.ref(self)
 
     def _part(self, v: Any) -> Any:
-        """The displacement's part of a trial or test function of the space of ``u``; what is one stays."""
+        """The displacement's part of a trial or test function of the space of ``u``; other arguments are returned unchanged."""
         return ufl.split(v)[self.displacement] if self.displacement is not None and isinstance(v, ufl.Argument) else v
 
     def _lagrangian(self, u: Any) -> Expr:
@@ -275,7 +275,7 @@ class VonMises(given.Sealed):
         return ufl.as_vector([A[0, 0], A[1, 1], *across, root * A[0, 1]])
 
     def _dilatation(self, A: Any) -> Expr:
-        """Trace of a strain; at the centre of axisymmetric cells, where it stands for the mean, what it is at the centre of the circles."""
+        """Trace of a strain; for one point per axisymmetric cell, the trace at the cell's centre of mass, for the mean over circles."""
         if self.kind != "axisymmetric" or self._pressure_points.degree:
             return ufl.tr(A)
         return ufl.tr(A) + ufl.dot(ufl.grad(A[0, 0] + A[1, 1]), centre_of_mass(self.mesh))
@@ -284,11 +284,11 @@ class VonMises(given.Sealed):
         """Internal virtual work of the material's cells.
 
         Args:
-            v: test function, of a mixed space its part or the whole.
+            v: test function; in a mixed space its displacement part or the whole.
 
         Returns:
-            The form, integrated over all cells, in those of other materials with zeros, so that it may be added to integrals over
-            any tagged cells.
+            The form, integrated over all cells, with zeros in cells of other materials, so that it may be added to integrals over any
+            tagged cells.
         """
         variation = self._variation(v)
         work = ufl.dot(self._s, self._vector(variation)) * self._points.dx
@@ -298,10 +298,10 @@ class VonMises(given.Sealed):
         return work + pressed * self._pressure_points.dx
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
-        """The part ``C : dE(u; du) : dE(u; v)`` of the tangent that ``ufl.derivative(residual(v), u)`` cannot see.
+        """The part ``C : dE(u; du) : dE(u; v)`` of the tangent that is missing in ``ufl.derivative(residual(v), u)``.
 
-        C is the consistent tangent of the last ``update``, symmetric; but in plane stress its deviatoric part, as the derivative
-        sees the pressure.
+        C is the symmetric consistent tangent of the last ``update``; except in plane stress only its deviatoric part, since the
+        derivative includes the pressure.
 
         Args:
             du: trial function.
@@ -339,21 +339,21 @@ class VonMises(given.Sealed):
         if layers is None:
             return returned(*begin, self._modulus)
         returned = layers.plane_stress_return if plane else layers.radial_return
-        # yield stresses are the layers' own
+        # yield stresses are data of the layers
         return returned(*begin[: -len(self._curve.parameters)])
 
     def _committed(self) -> tuple[Array, Array]:
-        """Plastic strain ``(n, k)`` and peeq ``(n,)`` of all points, of layers one after another."""
+        """Plastic strain ``(n, k)`` and peeq ``(n,)`` of all points, with layers one after another."""
         strains, peeq = self._points.read(self.plastic_strain), self._points.read(self.peeq)
         return strains.reshape(peeq.size, strains.shape[1] // peeq.shape[1]), peeq.ravel()
 
     def _mean(self, values: Array) -> Array:
-        """Of the layers of each point; values ``(n, ...)`` themselves where there are none."""
+        """Weighted mean over the layers of each point; values ``(n, ...)`` are unchanged without layers."""
         return values if self._layers is None else self._layers.mean(values)
 
     @property
     def has_slopes(self) -> bool:
-        """Whether gradients through histories know its derivatives: without back stresses, at this rank's points."""
+        """Whether gradients through histories are available: without back stresses, at this rank's points."""
         return self._layers is None and not self._modulus.any()
 
     def begins_with(self) -> tuple[Array, ...]:
@@ -363,11 +363,11 @@ class VonMises(given.Sealed):
 
     @property
     def stress_in_forms(self) -> fem.Function:
-        """The Function that stands for the stress in ``residual``: its deviator, but in plane stress itself."""
+        """The Function of the stress in ``residual``: its deviator, or in plane stress the whole stress."""
         return self._s
 
     def slopes(self, a: fem.Function, test: Any) -> PlasticSlopes:
-        """Derivatives through its load steps, for gradients through histories; arguments as of ``PlasticSlopes`` (collective)."""
+        """Derivatives through load steps, for gradients through histories; arguments as in ``PlasticSlopes`` (collective)."""
         from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 
         return PlasticSlopes(self, self._points, self._s, self._kappa, lambda w: self._vector(self._variation(w)), a, test)
@@ -395,16 +395,16 @@ class VonMises(given.Sealed):
             f.x.scatter_forward()
 
     def energy(self) -> float:
-        """Elastic energy stored at the present displacement, and that of the back stress (collective)."""
+        """Elastic energy at the present displacement, plus the energy of the back stress (collective)."""
         self.update()
         pressed = (self._bulk[:, None] * self._volume_changes() ** 2).ravel()
         return self._points.integrate(self._trial.energy) + self._pressure_points.integrate(pressed) / 2
 
     def dissipation(self) -> float:
-        """Plastic work done since the start, as committed, less that against the back stress (collective).
+        """Committed plastic work since the start, minus the work against the back stress (collective).
 
-        The energy stored by isotropic hardening is part of it; the work against the back stress comes back, and is part of
-        ``energy``. It follows from ``peeq`` alone.
+        It includes the energy stored by isotropic hardening. The work against the back stress is recoverable and part of ``energy``.
+        The result depends on ``peeq`` only.
         """
         return self._points.integrate(self._mean(self._curve.work(self._committed()[1])))
 
@@ -412,7 +412,7 @@ class VonMises(given.Sealed):
         """Means over the cells for output: ``stress`` and ``plastic_strain (3, 3)``, ``peeq`` and ``von_mises``, zero elsewhere.
 
         Returns:
-            DG0 Functions by name, filled anew by every call (collective).
+            DG0 Functions by name, overwritten by every call (collective).
         """
         root = np.sqrt(0.5)
         full = {"stress": self._points.read(self.stress), "plastic_strain": self._plastic_strains()}

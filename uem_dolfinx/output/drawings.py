@@ -1,4 +1,4 @@
-"""How a scene is drawn into the panel of a figure, 2D by matplotlib, 3D by PyVista: the same for all frames of a film."""
+"""Drawing of deformed bodies into the panel of a figure, 2D by matplotlib, 3D by PyVista, uniform for all frames of a film."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from uem_dolfinx.solve.problem import UnitedProblem
 #: are less have no arrow, and prescribed values are zero; points that are nearer are one where outlines are looked for.
 #: [convention; largest value, window's size, largest force; test_pictures.py::test_a_field_that_is_the_same_everywhere]
 EVEN = 1e-9
-#: Colour of what carries no contact pressure, and of rigid surfaces.
+#: Colours of surfaces without contact pressure, and of rigid surfaces.
 NO_PRESSURE, RIGID = "#d2d2d2", "#b2b2b2"
 FIELD = "a scalar expression, a contact or several, or None for the size of the displacement"
 
 
 class Drawing:
-    """Takes frames of a scene and draws them (making one is collective); arguments and errors are those of :func:`plot_scene`."""
+    """Collects frames and draws them (the constructor is collective); arguments and errors as in :func:`plot_scene`."""
 
     def __init__(
         self, problem: UnitedProblem, *, field: Any, label: str, levels: int | Sequence[float], scale: float,
@@ -77,7 +77,7 @@ class Drawing:
         self.take, self.pieces = gathering.take, gathering.pieces
 
     def over(self, frames: Sequence[Frame]) -> Drawn:
-        """What draws these frames, on rank 0: window, colours and lengths of arrows are the same for all of them."""
+        """Object that draws these frames, on rank 0, with the same window, colours and scale of arrows for all of them."""
         assert self.pieces is not None
         return (Drawn3D if frames[0].x.shape[1] == 3 else Drawn2D)(self, self.pieces, frames)
 
@@ -108,7 +108,7 @@ def checked_size(size: Any) -> tuple[float, float]:
 
 
 def _check_colours(name: Any) -> None:
-    """Refuse a colour map that matplotlib does not know; where there is none, who draws says so."""
+    """Refuse a colour map that matplotlib does not know; without matplotlib, drawing raises the error."""
     with suppress(ImportError):
         from matplotlib import colormaps
         from matplotlib.colors import Colormap
@@ -127,7 +127,7 @@ def _refuse_of_other_dimension(gdim: int, name: str, value: Any) -> None:
 
 
 class Drawn(ABC):
-    """Frames with a window, bounds of their colours and a colour bar in common."""
+    """Frames with a common window, common bounds of colours and a common colour bar."""
 
     def __init__(self, how: Drawing, pieces: Pieces, frames: Sequence[Frame]):
         self.how, self.pieces, self.frames = how, pieces, frames
@@ -135,13 +135,13 @@ class Drawn(ABC):
         if how.window is None and any(f.rigid for f in frames):
             sides = np.diff(self.box, axis=1)
             self.box = self.box + np.minimum(0.06 * sides.max(), 0.25 * sides) * np.array([-1.0, 1.0])
-        # a side of the scene that the window ends at is in it, whatever rounding makes of it
+        # sides of bodies at the limits of the window are visible, in spite of rounding
         self.box = self.box + EVEN * np.diff(self.box, axis=1) * np.array([-1.0, 1.0])
         seen = np.concatenate([f.values[self._shown(f.x)] for f in frames])
         if not len(seen):
             seen = np.concatenate([f.values for f in frames])
         least, most = float(seen.min()), float(seen.max())
-        # values that are drawn as one more colour may be few
+        # values outside the percentiles have the end colours
         ends = (least, most) if how.percentiles is None else np.percentile(seen, how.percentiles)
         #: Bounds of the colours.
         self.bounds = np.array(
@@ -149,33 +149,33 @@ class Drawn(ABC):
         )
         if how.pressed and self.bounds[0] == 0.0:
             self.bounds[0] = EVEN * self.bounds[-1]
-        #: Which ends of the colour bar have an arrow.
+        #: Ends of the colour bar with an arrow.
         self.extend = "neither"
         if not isinstance(how.levels, int) or how.percentiles is not None or how.pressed:
             self.extend = ("neither", "min", "max", "both")[int(least < self.bounds[0]) + 2 * int(most > self.bounds[-1])]
         self.cmap = _colours(how.cmap, how.pressed)
 
     def _everything(self) -> Array:
-        """Bounds of what is in any frame ``(gdim, 2)``."""
+        """Bounds of all frames ``(gdim, 2)``."""
         return np.stack(
             [np.min([f.x.min(axis=0) for f in self.frames], axis=0), np.max([f.x.max(axis=0) for f in self.frames], axis=0)],
             axis=1,
         )
 
     def _shown(self, x: Array) -> Array:
-        """Which points are in the window."""
+        """Mask of points in the window."""
         return np.asarray(((x >= self.box[:, 0]) & (x <= self.box[:, 1])).all(axis=1))
 
     def _arrows(self, frame: Frame) -> tuple[Array, Array]:
-        """Contact forces per tributary area: where they act and the arrows ``(n, gdim)``, the longest of all an eighth of the picture."""
+        """Contact forces per tributary area: positions and arrows ``(n, gdim)``; the longest is an eighth of the picture."""
         longest = max((float(p.max(initial=0.0)) for f in self.frames for _, _, p in f.forces), default=0.0)
-        # of its second largest side: a surface alone may be flat
+        # of its second largest side, since a surface may be flat
         unit = 0.125 * np.sort(np.ravel(np.diff(self.box, axis=1)))[-2] / (longest or 1.0)
         none = np.zeros((0, frame.x.shape[1]))
         found = [(none, none)]
         for at, force, pressure in frame.forces:
             size = np.linalg.norm(force, axis=1)
-            # vertices of quadratic triangles get a pressure, and forces of rounding
+            # vertices of quadratic triangles have pressures, but forces of rounding only
             pressed = size > EVEN * size.max(initial=0.0)
             found.append((at[pressed], unit * force[pressed] / size[pressed, None] * pressure[pressed, None]))
         where, arrows = (np.concatenate(part) for part in zip(*found))
@@ -187,7 +187,7 @@ class Drawn(ABC):
 
 
 def _bounds(least: float, most: float, levels: int) -> Array:
-    """Round bounds of so many colours; of one colour where the values are all the same."""
+    """Rounded bounds of a number of colours; a single colour for uniform values."""
     from matplotlib.ticker import MaxNLocator
 
     if most - least <= EVEN * max(abs(least), abs(most)):
@@ -196,7 +196,7 @@ def _bounds(least: float, most: float, levels: int) -> Array:
 
 
 def _colours(name: str, pressed: bool) -> Any:
-    """A colour map, of pressures with grey where there is none."""
+    """A colour map, for pressures with grey for zero."""
     from matplotlib.cm import ScalarMappable
 
     colours = ScalarMappable(cmap=name).cmap
@@ -249,7 +249,7 @@ class Drawn2D(Drawn):
 
 
 def draw_rigid(ax: Any, shape: Shape, box: Array, mirror: bool = False, **line: Any) -> None:
-    """A rigid surface in a box ``(2, 2)``, hatched behind it; ``line`` is how it ends, as matplotlib's contours."""
+    """Draw a rigid surface in a box ``(2, 2)``, hatched behind it; ``line`` are options of matplotlib's contour for its boundary."""
     (x, y), points = grid(box, 400)
     if mirror:
         points[:, 0] = np.abs(points[:, 0])
@@ -260,7 +260,7 @@ def draw_rigid(ax: Any, shape: Shape, box: Array, mirror: bool = False, **line: 
 
 
 class Drawn3D(Drawn):
-    """The outside of the bodies as PyVista sees it, in an image, with matplotlib's colour bar."""
+    """An image of the bodies' surface by PyVista, with matplotlib's colour bar."""
 
     def __init__(self, how: Drawing, pieces: Pieces, frames: Sequence[Frame]):
         super().__init__(how, pieces, frames)
@@ -281,7 +281,7 @@ class Drawn3D(Drawn):
         self.images = {id(f): image for f, image in zip(frames, images)}
 
     def _between(self, values: Array) -> Array:
-        """Values as the number of their colour from 0, below 0 where a pressure is none."""
+        """Values as numbers of colours from 0; negative for zero pressure."""
         number = np.interp(values, self.bounds, np.arange(len(self.bounds)))
         return np.where(values < self.bounds[0], -1.0, number) if self.how.pressed else number
 

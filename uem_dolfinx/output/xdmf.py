@@ -1,7 +1,7 @@
-"""Time series of fields in XDMF: ``NAME.xdmf`` says what stands where in ``NAME.bin``, the numbers as they are in memory.
+"""Time series of fields in XDMF: ``NAME.xdmf`` describes the contents of ``NAME.bin``, which has numbers in binary format.
 
-Everything is in the order of the mesh's input, so that any number of ranks writes the same files and goes on with them. A step is in
-the XDMF file once all of its numbers are in the other one: a run that is killed leaves whole steps.
+All data follow the input order of the mesh, so that any number of ranks writes the same files and can resume them. A step is added to
+the XDMF file after all of its numbers have been written: a killed run leaves complete steps only.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ TOPOLOGIES = {
     ("tetrahedron", 4): "Tetrahedron", ("tetrahedron", 10): "Tetrahedron_10",
     ("hexahedron", 8): "Hexahedron", ("hexahedron", 27): "Hexahedron_27",
 }  # fmt: skip
-#: What every file begins with.
+#: Beginning of every file.
 HEAD_OF_FILE = (
     '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n<Domain>\n<Grid Name="steps" GridType="Collection" CollectionType="Temporal">\n'
 )
-#: What every file ends with.
+#: End of every file.
 TAIL = "</Grid>\n</Domain>\n</Xdmf>\n"
-#: Characters that XML wants otherwise.
+#: Characters that XML escapes.
 ESCAPED = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;"})
-#: A step, and what is known of it.
+#: A step, with its time and number.
 STEP = re.compile(
     r'<Grid Name="mesh">\n<Time Value="([^"]+)"/>\n<Information Name="step" Value="(\d+)"/>\n.*?</Grid>\n', re.DOTALL
 )
@@ -49,8 +49,8 @@ class Table:
     """Rows of numbers at nodes or cells, in the order of the mesh's input.
 
     Attributes:
-        rows: this rank's, in its own order ``(n, width)``.
-        numbering: where they go.
+        rows: of this rank, in its own order ``(n, width)``.
+        numbering: their positions in the file.
     """
 
     rows: Callable[[], AnyArray]
@@ -64,19 +64,19 @@ class Table:
 
 
 class XdmfSeries:
-    """Fields over time on one mesh, whose nodes are those of a Lagrange space of the geometry's degree (making one is collective).
+    """Fields over time on one mesh, with the nodes of a Lagrange space of the geometry's degree (the constructor is collective).
 
     Args:
-        path: of the XDMF file, in a folder that is there.
+        path: of the XDMF file, in an existing folder.
         mesh: the mesh.
         nodal: scalar or vector Functions of that Lagrange space, with names.
         cellwise: scalar, vector or tensor DG0 Functions, with names.
-        resume_at: keep the steps of files that are there up to this number, and go on after them; the files stay as they are until
-            the first step is written. None begins new ones.
+        resume_at: keep the steps of existing files up to this number, and append to them; the files are unchanged until the first
+            step is written. None starts new files.
 
     Raises:
-        OutputError: if the files cannot be written, or another run writes those to go on with.
-        CheckpointError: if those to go on with hold other fields or another mesh.
+        OutputError: if the files cannot be written, or if another run writes the files to resume.
+        CheckpointError: if the files to resume have other fields or another mesh.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class XdmfSeries:
     ):
         self.path, self.comm, self._mesh = path, mesh.comm, mesh
         self._numbers = path.with_suffix(".bin")
-        #: The XDMF file on rank 0, and that of numbers on every rank.
+        #: The XDMF file on rank 0, and the file of numbers on every rank.
         self._text: OwnFile | None = None
         self._bin: OwnFile | None = None
         S = compat.function_space(mesh, geometry_degree(mesh))
@@ -102,9 +102,9 @@ class XdmfSeries:
                     known[id(V)] = _numbering(V)
                 self._fields.append((u, centre, self._field(u, known[id(V)])))
         self._cells, self._nodes = self._mesh_tables(S)
-        #: Steps in the files.
+        #: Number of steps in the files.
         self.n_steps = 0
-        #: Where the last one ends in the XDMF file, and whether the files go on behind it.
+        #: End of the last kept step in the XDMF file, and whether the files contain more.
         self._end, self._more = 0, False
         try:
             if resume_at is None or not on_rank_0(self.comm, self._trouble, path.exists):
@@ -116,7 +116,7 @@ class XdmfSeries:
             raise
 
     def close(self) -> None:
-        """Close the files; others may go on with them."""
+        """Close the files; other runs may then resume them."""
         for file in (self._text, self._bin):
             if file is not None:
                 file.close()
@@ -129,7 +129,7 @@ class XdmfSeries:
 
     @staticmethod
     def _field(u: fem.Function, numbering: Numbering) -> Table:
-        """Rows of a Function, vectors and tensors with three components in each direction, as XDMF wants them."""
+        """Rows of a Function; vectors and tensors have three components in each direction, as XDMF requires."""
         shape, n = tuple(u.ufl_shape), u.function_space.dofmap.index_map.size_local
 
         def rows() -> AnyArray:
@@ -147,14 +147,14 @@ class XdmfSeries:
         place.x.scatter_forward()
         n, keys = _cell_keys(self._mesh)
         cells = compat.vtk_nodes(compat.cell_name(self._mesh), place.x.array[compat.cell_dofs(S)[:n]].astype(np.int64))
-        # as they were read: those that DOLFINx tabulates are rounded in one of the cells around, which differs from partition to partition
+        # coordinates as read: tabulated ones are rounded in one of the adjacent cells, which depends on the partition
         x = np.empty((place.x.array.size, gdim))
         x[compat.cell_dofs(S)] = self._mesh.geometry.x[compat.geometry_dofs(self._mesh), :gdim]
         x = x[:owned]
         order = Numbering(self.comm, keys, n_cells(self._mesh))
         return Table(lambda: cells, cells.shape[1], order), Table(lambda: x, gdim, numbering)
 
-    # -- what the XDMF file says ---------------------------------------------------------------------------------------
+    # -- text of the XDMF file -----------------------------------------------------------------------------------------
 
     def _item(self, table: Table, seek: int, kind: str = "Float") -> str:
         return (
@@ -183,13 +183,13 @@ class XdmfSeries:
         return "\n".join([*lines, "</Grid>\n"])
 
     def _start(self, k: int) -> int:
-        """Where the k-th step begins in the file of numbers."""
+        """Beginning of the k-th step in the file of numbers."""
         return self._cells.size + self._nodes.size + k * sum(table.size for _, _, table in self._fields)
 
-    # -- writing and going on ------------------------------------------------------------------------------------------
+    # -- writing and resuming ------------------------------------------------------------------------------------------
 
     def _open(self, kind: type[UEMError] = OutputError, *, begin: bool = False) -> None:
-        """Open the file of numbers on every rank, a new one before others can see it (collective)."""
+        """Open the file of numbers on every rank, a new file under a temporary name (collective)."""
         path = self._numbers.with_name(f".{self._numbers.name}.{self.comm.bcast(os.getpid())}") if begin else self._numbers
         trouble = Trouble(self.comm, self._trouble, REMEDY, kind)
         for first in (True, False):
@@ -225,7 +225,7 @@ class XdmfSeries:
         trouble.agree()
 
     def _go_on(self, last: int) -> None:
-        """Find the steps to keep, and see that they are of this mesh and these fields (collective)."""
+        """Find the steps to keep, and check that they are of this mesh and these fields (collective)."""
         other = f"the results {self.path} belong to another run"
         remedy = "choose another name, or move them away to start anew"
 
@@ -262,7 +262,7 @@ class XdmfSeries:
         trouble.agree()
 
     def _make_ready(self) -> None:
-        """See, on rank 0, that the files are still this run's, and cut them behind the steps kept."""
+        """Check, on rank 0, that the files still belong to this run, and cut them after the kept steps."""
         assert self._text is not None and self._bin is not None
         self._text.check()
         self._bin.check(sized=False)
@@ -283,10 +283,10 @@ class XdmfSeries:
 
         Args:
             time: of the step in the files.
-            step: its number, by which ``resume_at`` knows it.
+            step: its number, for ``resume_at``.
 
         Raises:
-            OutputError: if they cannot be written; the steps before stay.
+            OutputError: if they cannot be written; previous steps are kept.
         """
         k = self.n_steps
         on_rank_0(self.comm, self._trouble, self._make_ready)
@@ -304,7 +304,7 @@ def geometry_degree(mesh: Any) -> int:
 
 
 def _cell_keys(mesh: Any) -> tuple[int, AnyArray]:
-    """Number of this rank's cells, and their numbers in the input; in meshes made from others, which have none, those over all ranks."""
+    """Number of this rank's cells, and their numbers in the input, or their global numbers in meshes made from other meshes."""
     cells = mesh.topology.index_map(mesh.topology.dim)
     n, given = cells.size_local, forms.original_cells(mesh)
     if all(mesh.comm.allgather(len(given) == n + cells.num_ghosts)):
@@ -313,7 +313,7 @@ def _cell_keys(mesh: Any) -> tuple[int, AnyArray]:
 
 
 def _numbering(V: Any) -> Numbering:
-    """Order of a space's nodes in the files: that of the input where the mesh knows it (collective)."""
+    """Order of a space's nodes in the files: the input order if the mesh has it (collective)."""
     mesh = V.mesh
     cells = mesh.topology.index_map(mesh.topology.dim)
     if all(mesh.comm.allgather(len(forms.original_cells(mesh)) == cells.size_local + cells.num_ghosts)):

@@ -1,4 +1,4 @@
-"""Length of load steps and time steps: halved where a step fails, doubled again up to the nominal one where steps are easy."""
+"""Length of load steps and time steps: halved on failure, doubled after easy steps, up to the nominal length."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EASY = 6
 REMAINDER = 1e-9
 
 
-#: What a shorter step may mend.
+#: Errors that a shorter step may avoid.
 MENDABLE = (
     errors.ConvergenceError, errors.LinearSolveError, errors.NotFiniteError, errors.InvertedElementError,
     errors.TunnellingError, errors.EnergyGivenError, errors.ThrownBodyError, errors.OverdeterminedError,
@@ -29,15 +29,15 @@ MENDABLE = (
 
 
 class StepControl:
-    """Length of the next step, and what is known of the steps before it.
+    """Length of the next step, with data of earlier steps.
 
     Args:
-        nominal: length of the steps where nothing fails, in load factor or time.
+        nominal: length of steps without failures, in load factor or time.
 
     Attributes:
         longest: bound on the length of the next step.
-        number: of steps done.
-        largest_energy: largest kinetic energy of the bodies that a time step has been judged by.
+        number: number of completed steps.
+        largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
     """
 
     def __init__(self, nominal: float = 1.0):
@@ -45,21 +45,21 @@ class StepControl:
         self._cuts, self._read, self._longest_before = 0, False, np.inf
 
     def begin(self, nominal: float) -> None:
-        """Go on with steps of another nominal length, and say so if it is another than that of the run that is gone on with."""
+        """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
         if self._read and nominal != self.nominal:
             logger.warning("going on with steps of %.6g; those of the run before the checkpoint were %.6g", nominal, self.nominal)
         self.nominal, self._cuts, self._read = nominal, 0, False
 
     @property
     def length(self) -> float:
-        """Length of the next step, where nothing else ends it."""
+        """Length of the next step, if nothing else limits it."""
         return min(self.longest, self.nominal)
 
     def shorten(self, length: float, error: errors.UEMError) -> bool:
         """Halve a step of this length that failed.
 
         Returns:
-            Whether to try again: not if the error has nothing to do with the length, or if the step would become too short.
+            Whether to try again: not if the error does not depend on the length, or if the step would become too short.
         """
         mendable = isinstance(error, MENDABLE)
         if not mendable or 0.5 * length < SHORTEST_LENGTH * self.nominal:
@@ -72,11 +72,11 @@ class StepControl:
         return True
 
     def give_up(self) -> None:
-        """After a step that fails for good, make the next one as long as that one was meant to be."""
+        """After a final failure, reset the length to its value before the failed step."""
         self.longest = self._longest_before
 
     def done(self, iterations: Sequence[object]) -> tuple[int, int]:
-        """Count a step that converged with this history; returns its number and how often it had been cut."""
+        """Count a step that converged with this history; returns its number and the number of its cuts."""
         if len(iterations) - 1 <= EASY:
             self.longest *= 2.0
         self._longest_before = self.longest
@@ -84,11 +84,11 @@ class StepControl:
         return self.number, cuts
 
     def to_checkpoint(self) -> dict[str, Any]:
-        """Numbers that a run goes on from, by name."""
+        """Numbers for a checkpoint, by name."""
         kept = {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
         return kept | {"nominal length": self.nominal}
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
-        """Go on from what ``to_checkpoint`` returned; other numbers may stand beside them."""
+        """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
         self.number, self.longest, self.largest_energy, self.nominal = (kept[name] for name in self.to_checkpoint())
         self._read, self._longest_before = True, self.longest

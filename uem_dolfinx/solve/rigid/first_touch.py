@@ -1,4 +1,4 @@
-"""What is touched first, told by how bodies would move if they followed their Dirichlet conditions rigidly, and what may be next."""
+"""Prediction of first contact, for bodies that follow their Dirichlet conditions rigidly, and of nodes that may be followed next."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def touch_ahead(
     place: Callable[[], None],
     look_within: Callable[[float], object],
 ) -> None:
-    """Where no contactor is pushed yet, activate those that rigid bodies would take deepest into their targets (collective).
+    """If there are no contact forces yet, activate the contactors that rigid motions move deepest into their targets (collective).
 
-    It saves the solve that would find them; those that are wrong are released before anything moves. Contactors with friction are left
-    to that solve, which tells the way that they slip.
+    This saves the solve that would find them; wrong ones are released before anything moves. With friction nothing is done, since a
+    solve is needed for the slip directions.
 
     Args:
-        bodies: that their conditions hold.
+        bodies: held by their conditions.
         pairs: of all contacts.
         rigid: motions of the bodies; None without contacts.
         place: projects all contactors.
-        look_within: looks at contacts that motions by a given length may bring near; see ``FarApart``.
+        look_within: searches contacts that may come near by motions of a given length; see ``FarApart``.
     """
     config, comm = bodies.config, bodies.comm
     known = reduced(comm, any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
@@ -60,12 +60,12 @@ def touch_ahead(
 
 
 def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequence[Violations]) -> list[Violations]:
-    """Of contactors that would all enter at once, those deep enough to touch at first, and all that are released (collective).
+    """Of contactors that would all be activated at once, only those deep enough for first contact, and all released ones (collective).
 
     Args:
         pairs: of all contacts.
         gaps: that decide on contact, of every pair ``(n,)``.
-        violated: contactors that are to change sides, of every pair; some contactor enters.
+        violated: violating contactors of every pair; at least one is to be activated.
     """
     config = pairs[0].config
     g, entering = config.gdim, [w.enter for w in violated]
@@ -79,7 +79,7 @@ def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequ
 
 
 def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[[Bools], Bools] | None:
-    """What tells the owned nodes of all target facets that have one of some nodes, each ``(n_owned,)``; None where no feet move.
+    """Function from a mask of nodes to the mask of owned nodes of target facets at these nodes ``(n_owned,)``; None without sliding.
 
     Args:
         config: configuration of the displacement.

@@ -1,10 +1,10 @@
-"""Load steps of given arc length: the load factor is an unknown more, so that a path is followed past limit points under dead load.
+"""Load steps of given arc length: the load factor is an additional unknown, to follow paths past limit points under dead load.
 
     Q'KP dq = Q'(r - K c) - dlam Q'F_lam,    t . (u + du - u0) = s,    F_lam = dF/dlam
 
-with t the direction in which the last step went: Riks' method, the constraint a plane, solved with the one united matrix and two
-right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are those of the displacement: fields
-beside it follow, and have no part in t, whatever their units are.
+with t the direction of the last step: Riks' method with a constraint plane, solved with a single constrained matrix and two right-hand
+sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are measured in the displacement only: other
+fields, with other units, have no part in t.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ MOST_STEPS = 100
 
 
 class ArcLength:
-    """A problem's contact by elimination, with the load factor as an unknown more; a ``newton.ContactMethod``.
+    """A problem's contact by elimination, with the load factor as additional unknown; a ``newton.ContactMethod``.
 
     Args:
-        problem: whose method and load are taken.
+        problem: with its method and load.
 
     Attributes:
-        factor: the load factor now.
+        factor: the present load factor.
     """
 
     def __init__(self, problem: UnitedProblem):
         assert isinstance(problem.system, BodySystem)
         self._problem, self._system, self._bodies = problem, problem.system, problem.bodies
         self.factor = 0.0
-        #: Number of the displacement's components here, which are the first of vectors.
+        #: Number of the displacement's components on this rank, which come first in vectors.
         self._n = problem.config.n_owned * problem.config.gdim
         self._direction, self._length = np.zeros(self._n), 0.0
         #: Displacement at the beginning of the step.
@@ -69,7 +69,7 @@ class ArcLength:
         Args:
             factor: committed load factor.
             direction: of unit length over all ranks, at the displacement's owned components.
-            length: how far the displacement goes along it.
+            length: of the displacement increment along it.
         """
         self._direction, self._length = direction, length
         self._start = self._bodies.displacement()
@@ -81,12 +81,12 @@ class ArcLength:
         self._problem.set_load(factor)
 
     def _along(self, way: PETSc.Vec) -> float:
-        """How far a way goes in the step's direction (collective)."""
+        """Component of an increment in the step's direction (collective)."""
         return float(reduced(self._problem.comm, self._direction @ way.array_r[: self._n]))
 
     @property
     def _missing(self) -> float:
-        """How much further the displacement has to go (collective)."""
+        """Missing displacement in the step's direction (collective)."""
         return self._length - self._along(self._bodies.displacement() - self._start)
 
     def place(self) -> None:
@@ -96,17 +96,17 @@ class ArcLength:
         self._system.place()
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
-        """Where the contactors belong; the state is closed if the arc has its length, too."""
+        """The targets of the contactors and their equations; the state is closed only if the arc has its length."""
         state = self._system.assemble_constraints(in_equilibrium)
         there = abs(self._missing) <= ON_THE_PLANE * self._length
         return replace(state, closed=state.closed and there)
 
     def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
-        """United matrix of a state, with the right-hand side without load increment, and the residual's derivative with the load factor."""
+        """Constrained matrix of a state, right-hand side without load increment, and the residual's derivative by the load factor."""
         if iteration is not None:
             self._differentiate()
         problem = self._system.linearise(state, iteration)
-        # the load increment is as accurate as the unknowns, and near limit points little is left by solutions that are far off
+        # exact solves: near limit points, solutions with small residuals may have large errors, also in the load increment
         return problem._replace(exact=not problem.iterative, iterative=False, passing=True, convex=False)
 
     def _differentiate(self) -> None:
@@ -122,7 +122,7 @@ class ArcLength:
         bodies.assemble()
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
-        """Unknowns with the load increment that takes them to the plane."""
+        """Unknowns with the load increment that satisfies the constraint plane."""
         system, state = self._system, problem.state
         load = state.test.transpose(self._slope)
         load.scale(-1.0)
@@ -138,7 +138,7 @@ class ArcLength:
         return Increment(dq, system.move(state, dq), rhs, free.linear_iterations + by_load.linear_iterations, free.left)
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
-        """The state in which wrong contactors have changed sides, as they are predicted under the new load."""
+        """The state with a changed active set, as predicted under the new load; see ``ContactMethod``."""
         assert isinstance(problem.state, BodyState)
         held = self._change * self._slope
         if problem.state.held is not None:
@@ -147,14 +147,14 @@ class ArcLength:
 
 
 class AlongArc:
-    """Advances a problem by steps of given arc length; the first step of all tells the length, by its load.
+    """Advances a problem by steps of given arc length; the first step, of given load, determines the length.
 
     Args:
-        problem: what is loaded.
+        problem: the problem.
 
     Attributes:
-        tried: part of the arc of all nominal steps that the last step was meant to take.
-        most: number of steps, over the nominal one, after which the path is given up.
+        tried: intended length of the last step, relative to the arc of all nominal steps.
+        most: largest number of steps relative to the nominal one, before the path is given up.
     """
 
     def __init__(self, problem: UnitedProblem):
@@ -191,7 +191,7 @@ class AlongArc:
             factor = self._arc.factor
             _check_values(problem)
             if factor > 1.0:
-                # the end is a load, which this state is near
+                # the last step has a given load, which is near
                 factor = 1.0
                 iterations = iterations[:-1] + self._by_load(factor)
         problem.commit()
@@ -203,18 +203,18 @@ class AlongArc:
         return factor, iterations
 
     def _by_load(self, factor: float) -> list[Iteration]:
-        """Equilibrium under a load that is given."""
+        """Equilibrium under a given load."""
         self._problem.set_load(factor)
         _check_values(self._problem)
         return self._problem.attempt()
 
     def _way(self, change: Array) -> Array:
-        """That of the displacement's owned components ``(n_owned * gdim,)`` in a change of all local unknowns ``(n,)``."""
+        """Change of the displacement's owned components ``(n_owned * gdim,)``, from a change of all local unknowns ``(n,)``."""
         config = self._problem.config
         return np.asarray(config.of(change)[: config.n_owned]).ravel()
 
     def _size(self, way: Array) -> float:
-        """Length of a way ``(n_owned * gdim,)`` (collective)."""
+        """Norm of an increment ``(n_owned * gdim,)`` (collective)."""
         return float(np.sqrt(reduced(self._problem.comm, way @ way)))
 
 

@@ -1,7 +1,7 @@
-"""Load steps that fail where the load is the largest that the bodies bear: what their errors say of it, and which ways lead on.
+"""Load steps that fail at a limit point, the largest load that the bodies bear: explanations and remedies in their errors.
 
-Newton's method finds no equilibrium beyond a limit point, however short the steps: contactors change sides for ever there, cells turn
-inside out or bodies flow away, whatever the mesh. The united matrix, which has negative eigenvalues beyond, tells it from other failures.
+Newton's method finds no equilibrium beyond a limit point, even with short steps: contactors cycle, cells are inverted or bodies flow away,
+with any mesh. It differs from other failures by negative eigenvalues of the constrained matrix.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ if TYPE_CHECKING:
 
 #: Errors at a limit point.
 FAILURES = (ConvergenceError, InvertedElementError, NotFiniteError)
-#: The remedy where no static path continues.
+#: The remedy if no static path continues.
 IN_TIME = "give them a mass and take time steps"
-#: The remedy on a path on which the load falls.
+#: The remedies on a path with decreasing load.
 WAYS_ON = "prescribe a displacement, or use load_steps(..., arc_length=True); where the bodies jump, give them a mass and take time steps"
 
 
 class LimitPoint:
-    """What is known of a load step that has failed for good, before the problem is back in its committed state (collective).
+    """Data of a load step that has finally failed, before the committed state is restored (collective).
 
     Args:
-        problem: as the last attempt has left it.
+        problem: after the last attempt.
         arc: whether steps of given arc length were taken.
     """
 
     def __init__(self, problem: UnitedProblem, arc: bool):
         self._problem, self._arc, self._motions = problem, arc, problem.rigid_motions()
         solver = problem.solver
-        #: Whether the united matrix of the last attempt had a negative eigenvalue, as far as the solver tells.
+        #: Whether the constrained matrix of the last attempt had a negative eigenvalue; False if unknown.
         self.indefinite = bool(solver.indefinite or solver.negative)
 
     def name(self, error: UEMError, reached: float, unstable: float | None) -> None:
-        """Say in an error that there may be no equilibrium farther on; the problem is in its committed state again (collective).
+        """Add to an error that there may be no equilibrium beyond; the committed state must be restored (collective).
 
         Args:
             error: of the last attempt.
             reached: load factor of the committed state.
-            unstable: the last one at which an equilibrium was unstable.
+            unstable: the last load factor with an unstable equilibrium, or None.
         """
         by_load = not self._arc and not self._is_led()
-        # an answer that is known takes the place of advice on meshes and numbers of iterations
+        # a known cause replaces advice on meshes and numbers of iterations
         known = isinstance(error, ConvergenceError) and (unstable is not None or self.indefinite) and by_load
         if unstable is not None:
             on = f"there: {WAYS_ON}" if by_load else f"there, and no static path may go on; {IN_TIME}"
@@ -66,7 +66,7 @@ class LimitPoint:
             )
 
     def _is_led(self) -> bool:
-        """Whether displacements that change with the load factor lead the bodies: Dirichlet values, or those of rigid surfaces."""
+        """Whether Dirichlet values or rigid surfaces move with the load factor (displacement control)."""
         problem = self._problem
         wanted = np.array(problem.committed)
         compat.set_bc_values(wanted, problem.bodies.bcs)
