@@ -1,7 +1,7 @@
 """The mesh in an input file of Abaqus or CalculiX: nodes, elements, and sets of nodes, of elements and of their sides.
 
-Of all keywords ``*NODE``, ``*ELEMENT``, ``*NSET``, ``*ELSET``, ``*SURFACE`` and ``*INCLUDE`` are read, as often as they stand there; data
-of others are passed over, and those that would make nodes or elements are refused.
+The keywords ``*NODE``, ``*ELEMENT``, ``*NSET``, ``*ELSET``, ``*SURFACE`` and ``*INCLUDE`` are read. Other keywords are skipped,
+except keywords that create nodes or elements, which are refused.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from uem_dolfinx.errors import MeshError
 from uem_dolfinx.geometry.found import KINDS, Block, Found
 from uem_dolfinx.log import logger
 
-#: Families of element types, and the kind that the digit after the name tells: solids; bodies in the plane, shells and membranes; lines.
+#: Families of element types, and the kind by the digits after the name: solids; plane bodies, shells and membranes; lines.
 FAMILIES = (
     (r"(?:C3D|DC3D|AC3D)(\d+)[A-Z]*", {
         4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 13: "pyramid13", 15: "wedge15", 20: "hexahedron20",
@@ -31,9 +31,9 @@ FAMILIES = (
     (r"(?:T2D|T3D|DC1D|R2D|RAX)(\d)[A-Z]*", {2: "line", 3: "line3"}),
     (r"(?:B2|B3|PIPE2|PIPE3|SAX|MAX)(\d)[A-Z]*", {1: "line", 2: "line3", 3: "line"}),
 )  # fmt: skip
-#: Types that are no part of a body.
+#: Element types that are not part of a body.
 BESIDE = r"(?:SPRING|DASHPOT|MASS|ROTARYI|HEATCAP|GAP|CONN|DCOUP|FRAME|JOINT|ITT|ISL|DRAG|US?\d).*|D"
-#: Keywords that would make or move nodes and elements.
+#: Keywords that create or move nodes and elements.
 MAKING = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SUBMODEL")
 NODES_OF = {"line": 2, "line3": 3} | {
     name: int(digits or KINDS[name.rstrip("0123456789")].vertices)
@@ -45,15 +45,15 @@ NODES_OF = {"line": 2, "line3": 3} | {
 
 @dataclass
 class Deck:
-    """What has been read, by the numbers and names of the file; sets are found without regard to capitals.
+    """Data read from a file, by its numbers and names; names of sets are case-insensitive.
 
     Attributes:
-        nodes: places.
+        nodes: positions.
         elements: kinds, and numbers of nodes.
-        nsets: names and numbers of nodes, by the name in capitals; ``elsets`` likewise of elements.
+        nsets: names and numbers of nodes, by the name in capitals; ``elsets`` the same for elements.
         surfaces: names, whether of elements, and pairs of a member and a side.
-        left_out: how many elements of each type are no part of a body; ``others`` are the numbers of these elements.
-        parts: how many parts there are, and instances of them.
+        left_out: number of elements of each type that is not part of a body; ``others`` are the numbers of these elements.
+        parts: numbers of parts and of instances.
     """
 
     nodes: dict[int, list[float]] = field(default_factory=dict)
@@ -70,7 +70,7 @@ def read_deck(path: Path) -> Found:
     """Read the mesh of an input file.
 
     Raises:
-        MeshError: for what cannot be read.
+        MeshError: if the file cannot be read.
     """
     deck = Deck()
     for keyword, options, rows in _keywords(path):
@@ -92,14 +92,14 @@ def read_deck(path: Path) -> Found:
 
 
 def _keywords(path: Path, around: tuple[Path, ...] = ()) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
-    """Keywords in capitals, their options likewise, and rows of what stands under them; files that are included in their place.
+    """Keywords and options in capitals, with their data rows; included files are inserted in place.
 
     Args:
         path: of the file.
-        around: files that it is included by.
+        around: files that include it.
 
     Raises:
-        MeshError: if a file that is included is missing, or includes itself.
+        MeshError: if an included file is missing, or includes itself.
     """
     keyword, options, rows = "", dict[str, str](), list[list[str]]()
     lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
@@ -125,7 +125,7 @@ def _keywords(path: Path, around: tuple[Path, ...] = ()) -> Iterator[tuple[str, 
 
 
 def _beside(path: Path, name: str) -> Path:
-    """A file that another one includes."""
+    """Path of an included file."""
     found = path.parent / name
     if not found.is_file():
         raise MeshError(f"{path} includes '{name}', which is not in its folder")
@@ -133,9 +133,9 @@ def _beside(path: Path, name: str) -> Path:
 
 
 def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str]]) -> None:
-    """Take in what stands under a keyword."""
+    """Store the data of a keyword."""
     if keyword in ("PART", "INSTANCE"):
-        # one part, where it is drawn, is the model
+        # a single part in its own position is the model
         deck.parts[keyword] = deck.parts.get(keyword, 0) + 1
         if deck.parts[keyword] > 1 or (keyword == "INSTANCE" and rows):
             raise ValueError(
@@ -176,13 +176,13 @@ def _generated(first: int, last: int, step: int = 1) -> range:
 
 
 def _once(known: dict[int, Any], what: str, number: int, value: Any) -> None:
-    """Take in a node or an element, which has its number for itself."""
+    """Store a node or an element with a unique number."""
     if known.setdefault(number, value) != value:
         raise ValueError(f"there are two {what}s {number}, as in an assembly: write the model as one flat input file")
 
 
 def _named(sets: dict[str, tuple[str, list[int]]], name: str) -> list[int]:
-    """Members of a set, which is made if there is none."""
+    """Members of a set, which is created if necessary."""
     return sets.setdefault(name.upper(), (name, []))[1]
 
 
@@ -196,7 +196,7 @@ def _members(sets: dict[str, tuple[str, list[int]]], value: str) -> list[int]:
 
 
 def _elements(deck: Deck, options: dict[str, str], lines: list[list[str]]) -> None:
-    """Take in elements of one type."""
+    """Store elements of one type."""
     name = options["TYPE"].upper()
     for pattern, kinds in FAMILIES:
         match = re.fullmatch(pattern, name)
@@ -207,7 +207,7 @@ def _elements(deck: Deck, options: dict[str, str], lines: list[list[str]]) -> No
         if re.fullmatch(BESIDE, name) is None:
             raise ValueError(f"the element type {name} is not known")
         deck.left_out[name] = deck.left_out.get(name, 0) + len(lines)
-        # elements go on in the next line after a comma
+        # a comma at the end continues an element in the next line
         firsts = [line[0] for before, line in zip([[], *lines], lines) if before[-1:] != [""]]
         numbers = [int(number) for number in firsts if number.isdigit()]
         deck.others.update(numbers)
@@ -261,7 +261,7 @@ def _found(deck: Deck) -> Found:
 
 
 def _places(numbers: Ints, wanted: Ints, what: str, by: str) -> Ints:
-    """Places of numbers of the file among those that there are, ascending; ``by`` says what names them."""
+    """Indices of numbers of the file in an ascending list; ``by`` describes their source for messages."""
     place = np.minimum(np.searchsorted(numbers, wanted), max(len(numbers) - 1, 0))
     missing = wanted[numbers[place] != wanted] if len(numbers) else wanted
     if missing.size:
@@ -270,7 +270,7 @@ def _places(numbers: Ints, wanted: Ints, what: str, by: str) -> Ints:
 
 
 def _places_of_cells(numbers: Ints, cells: Ints, nodes: Ints) -> Ints:
-    """Places of the nodes ``(n, k)`` of elements with these numbers ``(n,)``."""
+    """Indices of the nodes ``(n, k)`` of elements with these numbers ``(n,)``."""
     missing = ~np.isin(nodes, numbers)
     first = cells[int(missing.any(axis=1).argmax())]
     return _places(numbers, nodes, "node", f"element {first} has")
@@ -283,7 +283,7 @@ class _Sides:
         self._found, self._numbers = found, numbers
 
     def of(self, surface: str, members: list[tuple[Ints, str]]) -> list[Ints]:
-        """Vertices of the sides of a surface, one array for each number of them, from elements ``(n,)`` and the name of their side."""
+        """Vertices of the sides of a surface, one array for each number of vertices, from elements ``(n,)`` and side names."""
         rows: dict[int, list[Ints]] = {}
         for elements, side in members:
             for block, own in zip(self._found.cells, self._numbers.values()):
@@ -305,7 +305,7 @@ class _Sides:
 
     @cached_property
     def _single(self) -> dict[int, set[tuple[int, ...]]]:
-        """Vertices of the sides that one cell alone has, ascending, by their number."""
+        """Vertices of the sides that belong to a single cell, ascending, by the number of vertices."""
         rows: dict[int, list[Ints]] = {}
         for block in self._found.bodies:
             for side in KINDS[block.base].sides:
@@ -317,7 +317,7 @@ class _Sides:
         return found
 
     def _free(self, block: Block, which: Ints) -> list[Ints]:
-        """Vertices of those sides of some cells that no other cell has."""
+        """Vertices of the sides of some cells that belong to no other cell."""
         if block.dim < self._found.dim:
             return [block.data[which, : KINDS[block.base].vertices]]
         found = []

@@ -1,6 +1,6 @@
 """Rigid targets: surfaces given by a signed distance and its gradient, which may move between load steps.
 
-Anything with ``project(points) -> Projection`` is a target; these need no mesh and no communication.
+Any object with ``project(points) -> Projection`` is a target; rigid targets need no mesh and no communication.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from uem_dolfinx.parallel import ask
 
 @dataclass(frozen=True)
 class Motion:
-    """Rigid motion from the drawing to the present: ``x = about + Q (X - about) + translation``."""
+    """Rigid motion from the reference to the current position: ``x = about + Q (X - about) + translation``."""
 
     translation: Array  # (gdim,)
     Q: Array  # (gdim, gdim)
     about: Array  # (gdim,), a point of the drawing
 
     def carry(self, X: Array) -> Array:
-        """Where points ``X (n, gdim)`` of the drawing are now."""
+        """Current positions of reference points ``X (n, gdim)``."""
         return (X - self.about) @ self.Q.T + self.about + self.translation
 
     def back(self, x: Array) -> Array:
-        """Where points that are at ``x (n, gdim)`` now are in the drawing."""
+        """Reference positions of points that are now at ``x (n, gdim)``."""
         return (x - self.about - self.translation) @ self.Q + self.about
 
     def since(self, before: Motion, part: float) -> Motion:
-        """The last ``part`` of the motion from where ``before`` leads: the rest of the way of ``about``, the rest of the turn."""
+        """The last ``part`` of the motion since ``before``: of the displacement of ``about`` and of the rotation."""
         there = before.carry(self.about[None])[0]
         turn = part * rotation_vector(self.Q @ before.Q.T)
         at = there + (1.0 - part) * (self.about + self.translation - there)
@@ -43,7 +43,7 @@ class Motion:
 
     @classmethod
     def none(cls, gdim: int) -> Motion:
-        """No motion: everything is at its reference position."""
+        """No motion: the reference position."""
         return cls(np.zeros(gdim), np.eye(gdim), np.zeros(gdim))
 
 
@@ -52,9 +52,9 @@ class RigidProjection:
     """Projection onto a rigid surface; fields as in ``projection.Projection``, without nodes.
 
     Attributes:
-        points: where it was taken ``(n, gdim)``.
+        points: projected points ``(n, gdim)``.
         shape_operator: derivative of the normal in the tangent plane ``(n, gdim, gdim)``.
-        motion: of the surface when it was taken; None at its reference position.
+        motion: of the surface at the projection; None at its reference position.
     """
 
     gap: Array
@@ -75,22 +75,22 @@ class RigidProjection:
 
     @property
     def foot(self) -> Array:
-        """A rigid surface, which has no nodes, takes forces where the contactors are ``(n, gdim)``."""
+        """Point of action of forces: the contactor, since a rigid surface has no nodes ``(n, gdim)``."""
         return self.points
 
     @property
     def facet_size(self) -> Array:
-        """There are no facets."""
+        """Infinite, since there are no facets."""
         return np.full(len(self.gap), np.inf)
 
     @property
     def way_beyond(self) -> Array:
-        """There is no end to be beyond."""
+        """Zero, since there is no open end."""
         return np.zeros(len(self.gap))
 
     @property
     def from_end(self) -> Array:
-        """There is no end."""
+        """Infinite, since there is no open end."""
         return np.full(len(self.gap), np.inf)
 
     def hessians(self, which: Ints) -> Array:
@@ -98,7 +98,7 @@ class RigidProjection:
         return self.shape_operator[which]
 
     def turnings(self, which: Ints, s: Array) -> Array:
-        """Derivative of tangents ``s (k, gdim)``, which turn with the normal ``(k, gdim, gdim)``."""
+        """Derivative of tangents ``s (k, gdim)``, which rotate with the normal ``(k, gdim, gdim)``."""
         return -np.einsum("kg,kh,khi->kgi", self.normal[which], s, self.shape_operator[which])
 
     def normal_slopes(self, which: Ints) -> Array:
@@ -107,24 +107,25 @@ class RigidProjection:
 
 
 class RigidSurface(given.Sealed):
-    """Rigid target of any shape, still or moved as a rigid body.
+    """Rigid target of any shape, fixed or moved as a rigid body.
 
-    The gap is ``distance / |gradient|``, which is the signed distance wherever it is zero; a gradient of constant direction
-    measures the gap along that direction. All functions are of places of the drawing, wherever the surface has been moved to.
+    The gap is ``distance / |gradient|``, which vanishes on the surface and is the signed distance to first order; with a gradient
+    of constant direction it is the distance along this direction. All functions refer to the reference position, also after the
+    surface has been moved.
 
-    Functions get places x of shape ``(3, n)``, as DOLFINx's and those of friction do, z = 0 in 2D. Ones of points ``(n, gdim)``, with one
-    row for each point in what they return, are taken as well, all of a surface of the same kind: which kind it is, the shape of what
-    ``distance`` returns for five places or more tells.
+    Functions are called with points x of shape ``(3, n)``, as in DOLFINx, with z = 0 in 2D. Alternatively, all functions of a
+    surface take points ``(n, gdim)`` and return one row per point; the shape returned by ``distance`` for five or more points
+    decides.
 
     Args:
-        distance: of places ``(3, n)``, positive outside ``(n,)``, a length.
+        distance: at points ``(3, n)``, positive outside ``(n,)``, a length.
         gradient: its gradient, pointing out of the target ``(gdim, n)``.
-        hessian: its second derivative ``(gdim, gdim, n)``; None takes differences of the gradient.
+        hessian: its second derivative ``(gdim, gdim, n)``; None: differences of the gradient.
         name: for messages.
-        reference: point about which it turns and its moment is taken ``(gdim,)``; None is the origin.
-        stride: how far a contactor may move past it in a time step unseen, a length; infinite if it has no other side.
+        reference: point about which it rotates and its moment is taken ``(gdim,)``; None is the origin.
+        stride: largest motion of a contactor in a time step that cannot pass through it, a length; infinite for a solid without back.
 
-    The functions are called on each rank with the contactors there, and not at all where there are none.
+    On each rank, the functions are called with the contactors of this rank, and not called without contactors.
 
     Raises:
         InputError, InputTypeError: with the argument that is no function, no finite point or no positive length.
@@ -132,7 +133,7 @@ class RigidSurface(given.Sealed):
 
     n_nodes = 0
     averaged = faceted = False
-    #: Whether gaps are distances everywhere, not on the surface alone.
+    #: Whether gaps are distances everywhere, not only on the surface.
     measures = False
     dofs: Indices = np.zeros((0, 0), np.int32)
     keys: Ints = np.zeros(0, np.int64)
@@ -157,11 +158,11 @@ class RigidSurface(given.Sealed):
         self.hessian = None if hessian is None else points.of(hessian)
         self.motion: Motion | None = None
         self._reference = None if reference is None else given.vector(f"{name}: reference", reference)
-        #: Dimension that it is given in, None if its functions alone know.
+        #: Dimension of the arguments, None if only the functions determine it.
         self.gdim = None if self._reference is None else len(self._reference)
 
     def __repr__(self) -> str:
-        """Its kind, and where its reference point is now."""
+        """Its class, and the current position of its reference point."""
         if self.motion is None and self._reference is None:
             return f"{type(self).__name__}({self.name!r})"
         at = self.reference(self.gdim or 0)
@@ -170,17 +171,16 @@ class RigidSurface(given.Sealed):
     def move(
         self, translation: npt.ArrayLike, rotation: npt.ArrayLike | None = None, about: npt.ArrayLike | None = None
     ) -> RigidSurface:
-        """Put the surface where this motion from the drawing takes it, whatever motion it had before.
+        """Set the motion of the surface from its reference position; replaces any earlier motion.
 
-        Call it between load steps, usually from the function of the load factor that a problem gets as ``load``: being a
-        function of the factor alone, the motion of a step that fails and is cut is then that of the shorter step. Call it
-        alike on all ranks.
+        Call it between load steps, usually from the function ``load`` of the problem: as a function of the load factor alone, the
+        motion is then also correct in steps that are cut. Call it with the same values on all ranks.
 
         Args:
             translation: of the point ``about`` ``(gdim,)``.
-            rotation: angle in 2D, counter-clockwise; rotation vector ``(3,)`` in 3D; None does not turn.
-            about: point of the drawing to turn about ``(gdim,)``; None is the surface's reference point,
-                which is the point, centre or apex that a ready-made one is given.
+            rotation: angle in 2D, counter-clockwise; rotation vector ``(3,)`` in 3D; None: no rotation.
+            about: centre of rotation in the reference position ``(gdim,)``; None is the surface's reference point: point, centre or
+                apex of the predefined surfaces.
 
         Returns:
             The surface itself.
@@ -200,13 +200,13 @@ class RigidSurface(given.Sealed):
         return self
 
     def reference(self, gdim: int) -> Array:
-        """Where the point is now that the surface turns about and its moment is taken about ``(gdim,)``."""
+        """Current position of the reference point, about which the surface rotates and its moment is taken ``(gdim,)``."""
         if self.motion is not None:
             return self.motion.about + self.motion.translation
         return np.zeros(gdim) if self._reference is None else self._reference
 
     def distance_of(self, points: Array) -> Array:
-        """What ``distance`` says of points now ``(n, gdim)``: ``(n,)``."""
+        """Values of ``distance`` at current positions ``(n, gdim)``: ``(n,)``."""
         return self.distance(points if self.motion is None else self.motion.back(points))
 
     def project(self, points: Array) -> RigidProjection:
@@ -249,7 +249,7 @@ class RigidSurface(given.Sealed):
         )
 
     def continued(self, projection: RigidProjection, which: Ints) -> RigidProjection:
-        """The surface has no end."""
+        """Unchanged, since the surface has no end."""
         return projection
 
     def chords(self, projection: RigidProjection) -> Array:
@@ -281,7 +281,7 @@ class RigidSurface(given.Sealed):
         return T @ H @ T / length[:, None, None]
 
     def _asked(self, what: str, f: Callable[[Array], Array], points: Array, shape: tuple[int, ...]) -> Array:
-        """What a function of the surface says about ``points (n, gdim)``, which must have this shape; it is not asked about none."""
+        """Values of a function at ``points (n, gdim)``, which must have this shape; it is not called without points."""
         if not len(points):
             return np.zeros(shape)
         values = ask(f"{self.name}: {what}", lambda: np.asarray(f(points), dtype=float))
@@ -342,10 +342,10 @@ class RigidSphere(RigidSurface):
 
 
 class RigidCylinder(RigidSurface):
-    """Endless round cylinder in 3D, or the space around it.
+    """Infinite circular cylinder in 3D, or the space around it.
 
     Args:
-        point: on the axis ``(3,)``.
+        point: a point on the axis ``(3,)``.
         axis: its direction ``(3,)``, of any length.
         radius: a length.
         inside: the target is the space around the cylinder, and bodies touch it from inside.
@@ -357,7 +357,7 @@ class RigidCylinder(RigidSurface):
         a, p = given.direction("rigid cylinder: axis", axis, 3), given.vector("rigid cylinder: point", point, 3)
         radius, inside = given.length("rigid cylinder: radius", radius), given.flag("rigid cylinder: inside", inside)
         across = np.eye(3) - np.outer(a, a)
-        # in the plane across the axis it is a sphere
+        # a sphere in the plane perpendicular to the axis
         ball = RigidSphere(np.zeros(3), radius, inside)
 
         def hessian(x: Array) -> Array:
@@ -405,7 +405,7 @@ def rotation_matrix(turn: Array) -> Array:
 
 
 def rotation_vector(Q: Array) -> Array:
-    """What ``rotation_matrix`` makes ``Q (gdim, gdim)`` of, an angle ``(1,)`` or a rotation vector ``(3,)`` of half a turn at most."""
+    """Inverse of ``rotation_matrix``: angle ``(1,)`` or rotation vector ``(3,)`` of at most half a turn, from ``Q (gdim, gdim)``."""
     if len(Q) == 3:
         from scipy.spatial.transform import Rotation
 

@@ -1,6 +1,6 @@
-"""Functions of users' rigid surfaces: of places ``(3, n)``, as all of DOLFINx's and friction's are, or of points ``(n, gdim)``.
+"""Functions of users' rigid surfaces, with arguments ``(3, n)`` as in DOLFINx, or ``(n, gdim)``.
 
-Inside the package they are functions of points, whichever of the two they were written for: the shape of a distance tells.
+The package always calls them with points ``(n, gdim)``. The shape returned by ``distance`` decides which kind they are.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ LEAST_POINTS = 5
 
 
 class OfPoints:
-    """Makes functions of points ``(n, gdim)`` of a surface's distance, gradient and hessian, which are all of one kind.
+    """Converts distance, gradient and hessian of a surface, all of one kind, to functions of points ``(n, gdim)``.
 
     Args:
-        distance: of places ``(3, n)`` or points ``(n, gdim)``; returns ``(n,)``.
+        distance: function of ``(3, n)`` or ``(n, gdim)``; returns ``(n,)``.
     """
 
     def __init__(self, distance: Callable[[Array], Any]):
         self._distance = distance
-        #: Whether they are of places; None until the distance has been asked.
+        #: Whether their argument has the shape ``(3, n)``; None before the first call of the distance.
         self._of_places: bool | None = None
 
     def of(self, f: Callable[[Array], Any]) -> Callable[[Array], Any]:
-        """A function of points ``(n, gdim)``: what it returns for these has one row for each point."""
+        """The same function for points ``(n, gdim)``, with one row per point in the result."""
 
         def asked(points: Array) -> Any:
             n, g = points.shape
@@ -59,7 +59,7 @@ class OfPoints:
 
 
 def _places(points: Array) -> Array:
-    """Points ``(n, gdim)`` as places ``(3, n)``, the last one again where they are few."""
+    """Points ``(n, gdim)`` as an array ``(3, n)``; few points are padded with copies of the last."""
     n, g = points.shape
     x = np.zeros((3, max(n, LEAST_POINTS)))
     x[:g, :n] = points.T
@@ -68,7 +68,7 @@ def _places(points: Array) -> Array:
 
 
 def _rows(values: Array, n: int, g: int) -> Array:
-    """Values of n places with one row for each, of the coordinates that there are; others as they are."""
+    """Values at n points with one row per point and g components; other shapes are unchanged."""
     if values.shape[-1:] != (n,):
         return values
     return np.moveaxis(values[(slice(g),) * (values.ndim - 1)], -1, 0)

@@ -1,4 +1,4 @@
-"""Sharp edges and corners of surfaces in the reference configuration: there facets meet whose normals are farther apart than an angle."""
+"""Sharp edges and corners of surfaces in the reference configuration, where facet normals differ by more than an angle."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CORNER = 0.955
 
 
 class Edges(NamedTuple):
-    """What is at each side of the facets that this rank holds, ``(m, n_sides)`` each.
+    """Neighbours and sharpness at each side of this rank's facets, ``(m, n_sides)`` each.
 
     Attributes:
-        across: number over all ranks of the facet that shares the side, -1 where there is none or several.
-        sharp: sides where the normals of both facets are farther apart than the angle.
-        convex: those of them that are convex.
+        across: number over all ranks of the facet that shares the side, -1 for no or several facets.
+        sharp: sides at which the normals of both facets differ by more than the angle.
+        convex: sharp sides that are convex.
     """
 
     across: Ints
@@ -35,7 +35,7 @@ class Edges(NamedTuple):
 
 
 def sharp_edges(facets: TargetFacets, cosine: float = SHARP_EDGE) -> Edges:
-    """Edges between facets whose normals are farther apart than an angle with this cosine (collective)."""
+    """Edges between facets whose normals differ by more than the angle with this cosine (collective)."""
     X, n_sides, g = facets.config.X[facets.dofs], len(facets.shape.edges()), facets.config.gdim
     number = facets.first[facets.config.comm.rank] + np.arange(len(X))
     middle, normal = facets.middles(X)
@@ -50,9 +50,9 @@ def sharp_edges(facets: TargetFacets, cosine: float = SHARP_EDGE) -> Edges:
 
 
 def sharp_nodes(facets: TargetFacets, cosine: float = SHARP_EDGE, convex: bool = False) -> Bools:
-    """Which nodes of facets have two around them that are farther apart; if ``convex``, one falls away behind the other (collective).
+    """Nodes whose adjacent facets include two that differ by more than the angle; if ``convex``, at a convex corner (collective).
 
-    ``(m, nn)``. The tip of a cone is seen that has no sharp edge.
+    ``(m, nn)``. This includes the tip of a cone, which has no sharp edge.
     """
     config, X = facets.config, facets.config.X[facets.dofs]
     nodes, arms = facets.nodes.ravel(), (X.mean(axis=1, keepdims=True) - X).reshape(-1, config.gdim)
@@ -68,12 +68,12 @@ def sharp_nodes(facets: TargetFacets, cosine: float = SHARP_EDGE, convex: bool =
 
 
 def to_mean(cosine: float) -> float:
-    """Cosine of half the angle with this cosine: of the normals of two facets with the mean of both."""
+    """Cosine of half the angle with this cosine, which is the angle between a facet normal and the mean of two."""
     return float(np.sqrt(0.5 * (1.0 + cosine)))
 
 
 def pairs_of_equals(numbers: Ints) -> tuple[Ints, Ints]:
-    """Places of numbers ``(n,)`` that are equal, each with each and with itself ``(k,)``."""
+    """Pairs of indices of equal numbers ``(n,)``, including each index with itself ``(k,)``."""
     order = np.argsort(numbers, kind="stable")
     first, end = (np.searchsorted(numbers[order], numbers[order], side=side) for side in ("left", "right"))
     count = end - first

@@ -1,4 +1,4 @@
-"""Contact surfaces of a function space: contactors' nodes and their tributary areas, each rank for its own part."""
+"""Contact surfaces of a function space: contactor nodes and their tributary areas, distributed over the ranks."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ def surface_nodes(config: Configuration, tag: Tag) -> Indices:
 
 
 class Areas:
-    """Integrals of the shape functions over a surface, before and after it was deformed.
+    """Integrals of the shape functions over a surface, in the reference and the current configuration.
 
     Args:
         config: configuration of the displacement.
         tag: of the surface, or of points, which have no area.
-        facets: of the surface, if they are made already.
+        facets: of the surface, if available.
     """
 
     def __init__(self, config: Configuration, tag: Tag, facets: TargetFacets | None = None):
         self._config, self._tag, self._made = config, tag, facets
 
     def integral(self, q: Any, current: bool) -> ufl.Form:
-        """Of a scalar q over the surface of facets, where it is now or as it was drawn, in UFL."""
+        """Integral of a scalar q over the surface, current or in the reference configuration, in UFL."""
         stretch, metadata = 1.0, None
         if current:
             F = ufl.Identity(self._config.gdim) + ufl.grad(self._config.u)
-            # an area turns and stretches by the cofactors of F (Nanson)
+            # area vectors transform with the cofactors of F (Nanson)
             n = ufl.cofac(F) * ufl.FacetNormal(self._config.mesh)
-            # which is no polynomial
+            # the integrand is not a polynomial
             stretch, metadata = ufl.sqrt(ufl.dot(n, n)), {"quadrature_degree": 2 * self._config.degree + 1}
         if self._config.axisymmetric:
             stretch = stretch * circumference(self._config.mesh, self._config.u if current else None)
@@ -66,7 +66,7 @@ class Areas:
 
     @cached_property
     def reference(self) -> Array:
-        """Over the reference surface, per local node ``(n_local,)`` (first call: collective)."""
+        """Integrals over the reference surface, per local node ``(n_local,)`` (first call: collective)."""
         if self._tag.dim == 0:
             return np.zeros(self._config.n_local)
         return self._assembled(self._integrals(False))
@@ -77,20 +77,20 @@ class Areas:
 
     @property
     def current(self) -> Array:
-        """Over the surface where it is now, per local node ``(n_local,)`` (collective)."""
+        """Integrals over the current surface, per local node ``(n_local,)`` (collective)."""
         return self.reference if self._tag.dim == 0 else self._assembled(self._stretched)
 
     @cached_property
     def _sharp(self) -> tuple[TargetFacets, Ints, Ints, Exchange] | None:
-        """Facets, some of them with a node of theirs at a sharp edge ``(k,)``, and the exchange of these with the nodes' owners.
+        """Facets, pairs of facets and their nodes at sharp edges ``(k,)``, and the exchange with the nodes' owners.
 
-        None if no rank has any (first time: collective).
+        None if no rank has such nodes (first time: collective).
         """
         config, comm = self._config, self._config.comm
         try:
             facets = self._made or facets_of(config, self._tag, "contactor")
         except OrientationError:
-            # inside a body there is no outside to face
+            # a surface inside a body has no outer side
             return None
         facet, node = np.nonzero(sharp_nodes(facets))
         if not reduced(comm, len(facet)):
@@ -98,22 +98,22 @@ class Areas:
         return facets, facet, node, Exchange.to(comm, config.owner_of(facets.nodes[facet, node]))
 
     def at_sharp_edges(self, nodes: Indices) -> Bools:
-        """Which owned ``nodes (n,)`` are at edges or corners where normals of facets are more than 45 degrees apart (collective)."""
+        """Owned ``nodes (n,)`` at edges or corners where facet normals differ by more than 45 degrees (collective)."""
         if self._tag.dim == 0 or self._sharp is None:
             return np.zeros(len(nodes), bool)
         facets, facet, node, _ = self._sharp
         return followed_nodes(self._config, facets.dofs[facet, node])[nodes]
 
     def facing(self, nodes: Indices, normal: Array, current: bool) -> Array:
-        """Areas of contactors towards what they touch ``(n,)`` (collective).
+        """Areas of contactors that face the target ``(n,)`` (collective).
 
-        Those of the whole surface, but at a sharp edge, whose facets count as far as they face what is touched:
-        ``sum_f (int_f N_i) max(0, -n_f . n)``. So the area of a block's edge on a plane is that of its base.
+        Away from sharp edges, the area on the whole surface. At a sharp edge, facets are weighted by their orientation to the
+        target: ``sum_f (int_f N_i) max(0, -n_f . n)``. So, for a block on a plane, only its base counts at its edges.
 
         Args:
             nodes: owned nodes of the surface ``(n,)``.
-            normal: outward normals of what they touch ``(n, gdim)``.
-            current: whether of facets where they are now, else as they were drawn; normals are those of now.
+            normal: outward normals of the target ``(n, gdim)``.
+            current: whether areas are current or in the reference configuration; normals are always current.
         """
         areas = np.array((self.current if current else self.reference)[nodes])
         if self._tag.dim == 0 or self._sharp is None:
@@ -123,12 +123,12 @@ class Areas:
         return self._towards(areas, integrals(facets.shape, x, self._config.axisymmetric), nodes, normal, False)
 
     def of_functions(self, nodes: Indices, normal: Array | None, coefficients: Callable[[FacetShape], Array]) -> Array:
-        """Integrals of other functions over the reference surface, at sharp edges over what faces the target ``(n,)`` (collective).
+        """Integrals of other functions over the reference surface, at sharp edges over facets that face the target ``(n,)`` (collective).
 
         Args:
-            nodes: as of ``facing``.
-            normal: likewise; None where the whole surface counts.
-            coefficients: of these functions, from nodal values, of a shape of facets ``(nn, nn)``.
+            nodes: see ``facing``.
+            normal: see ``facing``; None: the whole surface counts.
+            coefficients: function of the facet shape that returns coefficients of these functions from nodal values ``(nn, nn)``.
         """
         config, facets = self._config, self._made or facets_of(self._config, self._tag, "contactor")
         parts = integrals(facets.shape, config.X[facets.dofs], config.axisymmetric) @ np.linalg.inv(coefficients(facets.shape))
@@ -136,9 +136,9 @@ class Areas:
         return areas if normal is None or self._sharp is None else self._towards(areas, parts, nodes, normal, True)
 
     def _towards(self, areas: Array, parts: Array, nodes: Indices, normal: Array, entire: bool) -> Array:
-        """Areas ``(n,)`` that are, at sharp edges, those of facets ``(m, nn)`` as far as they face what is touched (collective).
+        """Areas ``(n,)``, at sharp edges from facets ``(m, nn)`` weighted by their orientation to the target (collective).
 
-        Where they are to be ``entire``, facets count in full that face it at least half as much as the one that does most, others not.
+        If ``entire``, weights are 1 for facets that face the target at least half as much as the best one, and 0 for others.
         """
         assert self._sharp is not None
         config, (facets, facet, node, exchange) = self._config, self._sharp
@@ -164,7 +164,7 @@ def tributary_areas(config: Configuration, tag: Tag) -> Array:
 
 
 def followed_nodes(config: Configuration, dofs: Indices) -> npt.NDArray[np.bool_]:
-    """Which local nodes ``(n_local,)`` any rank names among its local nodes ``dofs``, of any shape (collective)."""
+    """Local nodes ``(n_local,)`` that occur in ``dofs``, local nodes in an array of any shape, of any rank (collective)."""
     return config.to_owners(dofs.ravel(), np.ones(dofs.size)) > 0
 
 

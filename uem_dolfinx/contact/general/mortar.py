@@ -1,6 +1,6 @@
-"""Mortar between the surfaces of many bodies: each body as a target of its own, of the facets of all bodies that follow it.
+"""Mortar between the surfaces of many bodies: each body is a separate target for the facets of all bodies that follow it.
 
-An equation of mortar has one direction: facets that meet at sharp edges are contactors of different contacts, see ``geometry.faces``.
+A mortar equation has one direction: facets that meet at a sharp edge belong to different contacts, see ``geometry.faces``.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from uem_dolfinx.geometry.skin import Apart, Skin
 
 
 class Body(MeshTarget):
-    """One body as what the facets of others may touch: those that were not behind its cells when a step was last kept.
+    """One body as a target of facets of other bodies that were not behind its cells at the end of the last accepted step.
 
     Args:
         skin: the surfaces of all bodies.
         facets: of the body.
         body: its number.
-        apart: pairs of sets of facets that never touch each other, as of ``Neighbours``.
-        overlap: bound on what facets may be inside it at the start, a length.
+        apart: pairs of sets of facets that never touch each other, see ``Neighbours``.
+        overlap: bound on the initial penetration of facets, a length.
     """
 
     def __init__(self, skin: Skin, facets: TargetFacets, body: int, apart: Sequence[Apart], overlap: float):
@@ -40,32 +40,32 @@ class Body(MeshTarget):
         own = np.flatnonzero(skin.body == body)
         #: Numbers of its facets among those of all bodies, over all ranks ``(m,)``.
         self.numbers: Ints = skin.first[skin.config.comm.rank] + own
-        #: Sets of nodes, and of all bodies' facets, that never touch facets of this body, with these.
+        #: Sets of nodes and of all bodies' facets that never touch certain facets of this body, and these facets.
         self._apart = [sets for a, f, b, h in apart for sets in ((a, f, h[own]), (b, h, f[own]))]
         self._planes = facets.middles(facets.x)
-        #: How far behind facets others may be: those farther behind than the body is thick look away from it.
+        #: Largest depth of opposite facets behind this body's facets, limited by its thickness.
         self._overlap = thickness(self, overlap)
 
     def commit(self) -> None:
-        """A step has been kept, or is gone back to."""
+        """Accept a step, or return to one."""
         self._planes, self._overlap = self.facets.middles(self.facets.x), np.zeros_like(self._overlap)
 
     def sets_of(self, surface: TargetFacets) -> Bools:
-        """Which facets of a surface are in the sets that never touch some of this body's ``(m, s)``."""
+        """Whether facets of a surface belong to sets that never touch certain facets of this body ``(m, s)``."""
         number = np.searchsorted(self.skin.entities, surface.entities)
         return np.column_stack([np.zeros((len(number), 0), dtype=bool), *(facets[number] for _, facets, _ in self._apart)])
 
     def excluded(self, nodes: Indices, facet: Ints) -> Bools:
-        """Which local nodes ``(n,)`` never touch the facets with these numbers that are nearest to them ``(n,)`` (collective)."""
+        """Whether local nodes ``(n,)`` never touch their nearest facets, with these numbers ``(n,)`` (collective)."""
         out = np.zeros(len(nodes), dtype=bool)
         for own, _, facets in self._apart:
             out |= own[nodes] & (self.of_facets(facet, facets.astype(np.int64)) > 0)
         return out
 
     def allowed(self, told: Array, facet: Ints) -> Bools:
-        """See ``MeshTarget``; of contactor facets are told where their middles were, and their sets ``(k, gdim + s)``."""
+        """See ``MeshTarget``; keys are the last accepted midpoints of contactor facets, and their sets ``(k, gdim + s)``."""
         where, sets = np.split(told, [self.skin.config.gdim], axis=1)
-        # facets of one side reach round it, below the planes of each other; those of the other side are behind the cells
+        # facets on the same side of a body may be below each other's planes; facets of the other side are behind the cells
         may = heights(where, facet, self._planes) >= -np.maximum(self.facets.depth, self._overlap)[facet]
         for k, (_, _, facets) in enumerate(self._apart):
             may &= ~((sets[:, k] > 0) & facets[facet])
@@ -73,7 +73,7 @@ class Body(MeshTarget):
 
 
 class AmongBodiesMortar(Mortar):
-    """Implements ``Discretisation``: contactor facets against those of one body that theirs follow."""
+    """Implements ``Discretisation``: contactor facets with the facets of one body that they follow."""
 
     target: Body
 
@@ -86,16 +86,16 @@ class AmongBodiesMortar(Mortar):
         """Project contactors and find the segments of their facets (collective); see ``Discretisation``."""
         found = super().place(points, state)
         assert isinstance(found.nearest, FacetProjection)
-        # a node of a sharp edge belongs to the faces that lie on the body
+        # at a sharp edge, a node counts only for faces that are covered by the body
         out = self._at_edge | self.target.excluded(self.nodes, found.nearest.facet)
         return replace(found, out=out & ~found.rows.covered)
 
     def told(self, facets: Ints) -> Array:
-        """What tells which facets of the body may be opposite to these, see ``Body.allowed`` ``(m, k)``."""
+        """Visibility keys of contactor facets, see ``Body.allowed`` ``(m, k)``."""
         return np.column_stack([self._middles[facets], self._sets[facets]])
 
     def commit(self) -> None:
-        """Contactors are in front of facets from where they are now."""
+        """Accept a step: current positions decide which side of facets contactors are on."""
         super().commit()
         self._middles = self.surface.x.mean(axis=1)
         self.target.commit()

@@ -1,4 +1,4 @@
-"""The contacts that a general contact consists of: nodes with bodies near them, facets with a body, and all with rigid surfaces."""
+"""The parts of a general contact: nodes with nearby bodies, facets with a body, and all nodes with rigid surfaces."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 
 class GeneralPart(Contact):
-    """One of the contacts that a general contact consists of."""
+    """Base of the parts of a general contact."""
 
     of_all_surfaces = True
-    #: Of all bodies.
+    #: Joint surface of all bodies.
     _skin: Skin
     #: Friction by pairs of surfaces.
     _by_pairs: ValuesOfPairs | None = None
@@ -43,16 +43,16 @@ class GeneralPart(Contact):
         return super().surface if self.coupling == "mortar" else self._skin.areas
 
     def friction_values(self) -> Array:
-        """Values that friction has at this rank's contactors, by whatever pair."""
+        """Friction parameters at this rank's contactors, for all pairs."""
         return super().friction_values() if self._by_pairs is None else self._by_pairs.values.ravel()
 
     def _take_friction(self, law: FrictionLaw, mu: Array | None) -> None:
-        """One value for all pairs is all that there is from then on."""
+        """Set one law and value for all pairs, which replaces friction by pairs."""
         self._by_pairs = None
         super()._take_friction(law, mu)
 
     def _friction_at(self, law: FrictionLaw, nodes: Indices, at: float) -> Array | None:
-        """Values at contactors ``(n,)``, of pairs those to begin with; None if none has friction (collective)."""
+        """Values at contactors ``(n,)``, with pairs the initial ones; None if no pair has friction (collective)."""
         if self._by_pairs is None or self._pair is not None:
             return super()._friction_at(law, nodes, at)
         if not reduced(self.config.comm, bool(self._by_pairs.at(nodes).any()), op=MPI.LOR):
@@ -61,34 +61,34 @@ class GeneralPart(Contact):
 
 
 class RigidContact(GeneralPart):
-    """One of the contacts that a general contact consists of: every node against a rigid surface."""
+    """Part of a general contact: all nodes with a rigid surface."""
 
 
 class BodiesContact(GeneralPart):
-    """One of the contacts that a general contact consists of: of bodies with bodies."""
+    """Part of a general contact: bodies with bodies."""
 
     def on_skin(self, facet: Ints) -> Ints:
-        """Numbers among the facets of all bodies of those that contactors are on ``(n,)``, -1 for none (collective)."""
+        """Facets of contactors, numbered over the facets of all bodies ``(n,)``, -1 for no facet (collective)."""
         return facet
 
     def opposite(self, skin: Skin) -> Ints:
-        """Numbers of the bodies that contactors are on ``(n,)``, -1 for none (collective)."""
+        """Numbers of the bodies opposite to contactors ``(n,)``, -1 for no body (collective)."""
         return np.asarray(skin.values_at(self.on_skin(self.pair.projection.facet), skin.body))
 
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
-        """Values by what contactors are on, or would touch ``(n,)``; None where they do not depend on that (collective)."""
+        """Values by the body opposite to contactors ``(n,)``; None if they do not depend on it (collective)."""
         if self._by_pairs is None:
             return super()._friction_now(kinematics)
         return None if not self.pair.asked else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
 
     @property
     def watches_ends(self) -> bool:
-        """No: contactors come and go past the edges of bodies."""
+        """False, since contactors pass the edges of bodies regularly."""
         return False
 
 
 class AmongContact(BodiesContact):
-    """One of the contacts that a general contact consists of: every node against one body near it."""
+    """Part of a general contact: every node with one nearby body."""
 
     def __init__(self, neighbours: Neighbours, number: int, together: list[AmongContact], **options: Any):
         from uem_dolfinx.contact.general.nodes import AmongBodies, AmongQuadraticBodies
@@ -106,7 +106,7 @@ class AmongContact(BodiesContact):
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
 
     def pressing(self) -> tuple[Array, Array]:
-        """With forces by which nodes at sharp edges are followed by what they follow: these press on the same areas (collective)."""
+        """Forces, including forces from nodes of the other body that follow this node at sharp edges (collective)."""
         (across, along), pair = super().pressing(), self.pair
         if not pair.asked:
             return across, along
@@ -116,19 +116,19 @@ class AmongContact(BodiesContact):
         return across + spread(pressing), along + np.column_stack([spread(part) for part in sliding.T])
 
     def leads(self) -> Bools:
-        """See ``ContactResults``: those whose bodies follow, not those at edges that are followed as well (collective)."""
+        """See ``ContactResults``: contactors of bodies that follow in the order; not edge nodes in the opposite direction (collective)."""
         skin, place = self._skin, self._neighbours.place
         body = skin.values_at(self.pair.projection.facet, skin.body)
         return np.asarray((body >= 0) & (place[skin.body_of_node[self.pair.nodes]] <= place[body]))
 
     def edges_that_meet(self) -> Meeting:
-        """Those of all bodies."""
+        """Sharp edges of all bodies."""
         from uem_dolfinx.contact.warnings.edges_inside import Meeting
 
         return Meeting(self._skin, self._skin, self._neighbours.apart, self._neighbours.itself)
 
     def _received(self) -> Array:
-        """Forces on active contactors by nodes of the body that they touch which follow them, where either is at a sharp edge.
+        """Forces on active contactors by nodes of the touched body that follow them, if one of the two is at a sharp edge.
 
         Returns:
             ``(n, gdim)`` (collective).
@@ -152,12 +152,12 @@ class AmongContact(BodiesContact):
 
     @property
     def sees_corners(self) -> bool:
-        """No: every node is beside something, and every corner of one body within the surface of all."""
+        """False, since corners of all bodies are contactors themselves."""
         return False
 
 
 class MortarContact(BodiesContact):
-    """One of the contacts that a general contact consists of: facets of all bodies that follow one body, of smooth faces, against it."""
+    """Part of a general contact: one target body with the facets, on smooth faces, of all bodies that follow it."""
 
     def __init__(self, contactor: Tag, target: Tag, body: Body, **options: Any):
         super().__init__(contactor, target, coupling="mortar", **options)
@@ -167,14 +167,14 @@ class MortarContact(BodiesContact):
         return surface_nodes(config, self.contactor), self._body
 
     def _discretised(self, nodes: Indices, target: Any, **how: Any) -> tuple[Discretisation, None]:
-        """Mortar against the body (collective)."""
+        """Mortar discretisation with the body as target (collective)."""
         from uem_dolfinx.contact.general.mortar import AmongBodiesMortar
 
         surface = TargetFacets(self.config, self.contactor, "contactor")
         return AmongBodiesMortar(self.config, nodes, target, surface=surface, **how), None
 
     def edges_that_meet(self) -> Meeting:
-        """Those of all bodies, none with itself."""
+        """Sharp edges of all bodies, without self-contact."""
         from uem_dolfinx.contact.warnings.edges_inside import Meeting
 
         return Meeting(self._skin, self._skin, self._body.apart, np.zeros(self._skin.n_bodies, dtype=bool))
@@ -184,5 +184,5 @@ class MortarContact(BodiesContact):
         return np.asarray(self._body.of_facets(facet, self._body.numbers))
 
     def opposite(self, skin: Skin) -> Ints:
-        """The one body, also of contactors that nothing is opposite to: rows of others may have them."""
+        """The one body, also for contactors without opposite facets, since rows of other contactors may contain them."""
         return np.full(len(self.pair.nodes), self._body.number)

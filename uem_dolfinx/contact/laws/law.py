@@ -1,9 +1,9 @@
-"""What a law of friction says, and how a law in one file is handed to a contact.
+"""Friction laws: protocol, and conversion of user input.
 
-A contactor that sticks bears any force along the target up to a limit; one that slips bears the limit against its way, or, by a law of
-rate, what it bears at the speed at which it slips. The law is this limit and its derivatives with the force along the normal, from which
-test rows are rotated, and with the speed. ``coulomb``, ``tresca`` and ``stribeck`` are examples of a file each: a law of the user's own is
-a class with the same attributes, and is given to ``Contact`` as ``friction``.
+The tangential force of a sticking contactor is at most the limit. For a slipping contactor it equals the limit, or with a rate law
+a function of the slip speed, and opposes slip. A law consists of the limit and its derivatives by the normal force, which rotate
+the test rows, and by the speed. ``coulomb``, ``tresca`` and ``stribeck`` are examples, one file each. A user's own law is a class
+with the same attributes, passed to ``Contact`` as ``friction``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
-#: A number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``; or one of place and of the load factor,
-#: in dynamics of the time, that returns ``(n,)`` or a number; or an ``OfTemperature``.
+#: A number, or a function of position, called with reference points ``(3, n)``, that returns ``(n,)``; or a function of position
+#: and of load factor or time that returns ``(n,)`` or a number; or an ``OfTemperature``.
 Field: TypeAlias = float | Callable[..., npt.ArrayLike]
 
 
@@ -33,19 +33,19 @@ class FrictionLaw(Protocol):
 
     @property
     def field(self) -> Field:
-        """Its one parameter by place, 0 where there is no friction."""
+        """Its parameter as a field, 0 where there is no friction."""
 
     @property
     def per_area(self) -> bool:
         """Whether its limit needs the contactors' areas."""
 
     def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
-        """The largest force along the target, and its derivative with the force along the normal.
+        """The largest tangential force, and its derivative by the normal force.
 
         Args:
             value: of ``field`` at the contactors ``(n,)``.
-            lam: forces along the normal, 0 or positive ``(n,)``.
-            area: of the reference surface that these are integrals over ``(n,)``; zeros unless ``per_area``.
+            lam: normal forces, 0 or positive ``(n,)``.
+            area: reference areas of the contactors ``(n,)``; zeros unless ``per_area``.
 
         Returns:
             A force and a number for each contactor ``(n,)``.
@@ -53,19 +53,19 @@ class FrictionLaw(Protocol):
 
 
 class RateLaw(FrictionLaw, Protocol):
-    """A law of friction by which contactors that slip bear another force than those that are about to."""
+    """A friction law in which the force while slipping differs from the limit of sticking."""
 
     @property
     def timed(self) -> bool:
-        """Whether the speed of slip counts; statics has none."""
+        """Whether the law depends on the slip speed, which statics does not have."""
 
     def sliding(self, value: Array, lam: Array, area: Array, speed: Array) -> tuple[Array, Array, Array]:
-        """Force along the target of contactors that slip, and its derivatives with the force along the normal and with the speed.
+        """Tangential force of slipping contactors, and its derivatives by the normal force and by the speed.
 
         Args:
-            value: as of ``limit``.
-            lam: likewise.
-            area: likewise.
+            value: see ``limit``.
+            lam: see ``limit``.
+            area: see ``limit``.
             speed: of slip, 0 or positive ``(n,)``; zeros unless ``timed``.
 
         Returns:
@@ -74,17 +74,17 @@ class RateLaw(FrictionLaw, Protocol):
 
 
 def slides_otherwise(law: FrictionLaw) -> TypeGuard[RateLaw]:
-    """Whether contactors that slip bear another force than those that are about to."""
+    """Whether the force while slipping differs from the limit of sticking."""
     return hasattr(law, "sliding")
 
 
 def of_rate(law: FrictionLaw) -> bool:
-    """Whether the speed of slip counts."""
+    """Whether the law depends on the slip speed."""
     return slides_otherwise(law) and law.timed
 
 
 def as_law(friction: Any) -> FrictionLaw:
-    """The law that a contact was given: Coulomb's where it is a number or a function; refuse all else."""
+    """The friction law of user input: Coulomb's law for a number or a function; refuse other types."""
     if hasattr(friction, "limit"):
         given.kind(
             "friction", friction, not isinstance(friction, type), "a number, a function or a law", "make the law with its numbers"
@@ -94,7 +94,7 @@ def as_law(friction: Any) -> FrictionLaw:
 
 
 def given_friction(friction: Any) -> Field | FrictionLaw:
-    """Friction that was given, a number, a function or a law; refuse all else."""
+    """Checked user input for friction: a number, a function or a law."""
     law = as_law(friction)
     if not callable(law.field):
         given.number("friction", law.field, given.NOT_NEGATIVE)
@@ -102,24 +102,24 @@ def given_friction(friction: Any) -> Field | FrictionLaw:
 
 
 def given_field(what: str, value: Any, within: given.Range = given.FINITE) -> Field:
-    """A number of a range or a function of place that was given; refuse all else."""
+    """Checked user input: a number of a range or a function of position."""
     return cast(Field, value) if callable(value) else given.number(what, value, within)
 
 
 def parameters(law: FrictionLaw) -> list[Any]:
-    """What a law was made with, ``field`` first; what was left out aside."""
+    """The arguments of a law, ``field`` first, without arguments that are None."""
     others = [value for name, value in getattr(law, "__dict__", {}).items() if name != "field" and value is not None]
     return [law.field, *others]
 
 
 def follows_load(law: FrictionLaw) -> bool:
-    """Whether the law's parameter is a function of place and of the load factor or time, of two arguments, or of temperature as well."""
+    """Whether the law's parameter is a function of position and load factor or time, or also of temperature."""
     if not callable(law.field) or isinstance(law.field, OfTemperature):
         return callable(law.field)
     try:
         arguments = signature(law.field).parameters.values()
     except (TypeError, ValueError):
-        # a function of C's
+        # a C function without signature
         return False
     asked = [a for a in arguments if a.default is a.empty and a.kind in (a.POSITIONAL_ONLY, a.POSITIONAL_OR_KEYWORD)]
     return len(asked) == 2
@@ -128,22 +128,22 @@ def follows_load(law: FrictionLaw) -> bool:
 def values_at(
     law: FrictionLaw, config: Configuration, nodes: Indices, name: str, areas: bool, at: float, T: Array | None = None
 ) -> Array | None:
-    """Parameters of a law at contactors ``nodes (n,)`` of the contact of this name ``(n,)`` (collective).
+    """Parameter of a law at contactors ``nodes (n,)`` of a contact: ``(n,)`` (collective).
 
     Args:
         law: of friction.
         config: configuration of the displacement.
         nodes: contactors ``(n,)``.
         name: of the contact.
-        areas: whether the contactors have any.
+        areas: whether the contactors have areas.
         at: load factor or time.
-        T: temperatures at the contactors ``(n,)``, for a law that follows them.
+        T: temperatures at the contactors ``(n,)``, for a law that depends on them.
 
     Returns:
-        The values; None if all are zero and stay so.
+        The values; None if all are zero and constant.
 
     Raises:
-        InputError, UserFunctionError: if the law needs areas and the contactors have none, or if a function is no good.
+        InputError, UserFunctionError: if the law needs areas and the contactors have none, or if a function is invalid.
     """
     if law.per_area and not areas:
         raise InputError(f"contact '{name}': {type(law).__name__} needs areas, and points have none: give facets")
@@ -163,18 +163,18 @@ def values_at(
 def asked_at(
     config: Configuration, nodes: Indices, words: str, f: Callable[..., npt.ArrayLike], within: given.Range, *more: Any
 ) -> Array:
-    """What a function of place, which ``words`` name, returns at the reference places of ``nodes (n,)``: ``(n,)`` (collective).
+    """Values of a function of position, named by ``words``, at the reference positions of ``nodes (n,)``: ``(n,)`` (collective).
 
     Args:
         config: configuration of the displacement.
         nodes: owned nodes ``(n,)``.
         words: for messages.
         f: the function.
-        within: values that it may have.
-        more: what else it is given, a load factor or time, and temperatures ``(n,)``; a number then stands for all places.
+        within: allowed values.
+        more: further arguments, load factor or time, and temperatures ``(n,)``; the function may then return one number.
 
     Raises:
-        InputError, UserFunctionError: if it returns anything else than so many numbers of the range, or raises.
+        InputError, UserFunctionError: if it does not return n numbers in the range, or raises.
     """
     n = len(nodes)
     places = np.zeros((3, n))
