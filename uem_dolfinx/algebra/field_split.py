@@ -1,11 +1,11 @@
-"""PETSc's field split among other fields: which rows are whose, what multigrid is told of the displacement's, and what residuals weigh.
+"""PETSc's field split for mixed problems: rows of each field, near-null space of the displacement, and scaling of residuals.
 
-A force, a volume and a heat cannot be added: iterations would end where the field with the largest numbers has converged. So the rows and
-columns of each field beside the displacement are multiplied by a number s, as of a pressure with ``S = C + B A^-1 B'``,
+Residuals of fields with different units cannot be added: iterations would end as soon as the field with the largest numbers has converged.
+So rows and columns of each field other than the displacement are multiplied by a number s; for a pressure with ``S = C + B A^-1 B'``,
 
     s^2 mean(diag S) = mean(diag A),    diag S = |diag C| + B^2 / mean(diag A),
 
-whatever units it has.
+independent of its units.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from uem_dolfinx.parallel import reduced
 
 
 class SolverOfFields(UnitedSolver):
-    """KSP of a displacement among other fields; options may ask for a preconditioner of type fieldsplit."""
+    """KSP of a mixed problem; options may select a preconditioner of type fieldsplit."""
 
-    #: By what rows and columns are multiplied, and what the preconditioner is made of.
+    #: Factors of rows and columns, and the scaled matrix of the preconditioner.
     _scales: PETSc.Vec
     _scaled: PETSc.Mat
 
@@ -61,14 +61,14 @@ class SolverOfFields(UnitedSolver):
 
 
 def begin(pc: PETSc.PC, unknowns: Any, A: PETSc.Mat, restriction: Restriction) -> None:
-    """Let a preconditioner forget the matrix before, and name the rows of fields to it (collective).
+    """Reset a preconditioner, and set the rows of its fields (collective).
 
-    Those of the displacement are ``u``, with its rigid-body modes, those of others have the number of their part of the mixed space.
+    The displacement's field is named ``u`` and has the rigid-body modes; other fields are named by their number in the mixed space.
 
     Args:
         pc: of type fieldsplit.
         unknowns: of the mixed space.
-        A: united matrix.
+        A: constrained matrix.
         restriction: P.
     """
     rows = _rows(unknowns)
@@ -79,7 +79,7 @@ def begin(pc: PETSc.PC, unknowns: Any, A: PETSc.Mat, restriction: Restriction) -
 
 
 def scales(unknowns: Any, A: PETSc.Mat, restriction: Restriction) -> PETSc.Vec:
-    """Numbers s by which rows and columns are to be multiplied, 1 of the displacement (collective); arguments as of ``begin``."""
+    """Factors s of rows and columns, 1 for the displacement (collective); arguments as in ``begin``."""
     rows, used, field = _rows(unknowns), restriction.used.ravel(), unknowns.field
     diagonal, s = np.abs(A.getDiagonal().array_r), unknowns.vector(np.ones(len(field)))
     own = np.array([(diagonal[used & (field == f)].sum(), (used & (field == f)).sum()) for f in range(unknowns.n_fields)])
@@ -95,14 +95,14 @@ def scales(unknowns: Any, A: PETSc.Mat, restriction: Restriction) -> PETSc.Vec:
 
 
 def scaled(A: PETSc.Mat, s: PETSc.Vec) -> PETSc.Mat:
-    """A copy of A whose rows and columns are multiplied (collective)."""
+    """A copy of A with rows and columns multiplied by s (collective)."""
     out = A.copy()
     out.diagonalScale(s, s)
     return out
 
 
 def _rows(unknowns: Any) -> list[PETSc.IS]:
-    """Of each field; components that fill up the last row belong to the last field (collective)."""
+    """Rows of each field; padding components of the last row belong to the last field (collective)."""
     first = unknowns.block * unknowns.first
     field = np.where(unknowns.field < 0, unknowns.n_fields - 1, unknowns.field)
     owned = (np.flatnonzero(field == f) + first for f in range(unknowns.n_fields))

@@ -1,8 +1,8 @@
-"""Solves by the factorisation of an earlier united matrix, where little has changed since.
+"""Solves with the factorisation of an earlier constrained matrix as preconditioner, if the matrix has changed little.
 
-While contactors slide, P and the curvature of the contact change by little and near the contact only, and so does the tangent of bodies
-that are hardly strained any more: a Krylov method that has the old factorisation as its preconditioner takes a few of its solves, a new
-one as long as some ten. No united matrix is made for it.
+While contactors slide, P and the curvature of the contact change little and near the contact only, and so does the tangent of bodies
+whose strains hardly change. A Krylov method preconditioned by the old factorisation takes a few solves; a new factorisation takes as long
+as about ten. The constrained matrix is not assembled.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LEAST_ACCURATE = 1e-3
 
 
 class KeptFactor:
-    """The last factorisation of ``P'KP``, and what it was made with.
+    """The last factorisation of ``P'KP``, with data of its matrix.
 
     Args:
         space: the space that K acts on.
@@ -44,21 +44,21 @@ class KeptFactor:
     def __init__(self, space: Nodes):
         self.space = space
         self._pc: Any = None
-        #: Which columns of P were used, and the diagonal of K.
+        #: Mask of the used columns of P, and the diagonal of K.
         self._made_with: Any = None
 
     def keep(self, pc: PETSc.PC, P: Restriction, K: PETSc.Mat) -> None:
-        """Take a factorisation that has just been made; with other fields none, since what is left of a force may be all of a heat."""
+        """Keep a new factorisation; not in mixed problems, where one tolerance does not fit residuals with different units."""
         if self.space.mixed:
             return
         self._pc, self._made_with = pc, (P.used, K.getDiagonal())
 
     def drop(self) -> None:
-        """Let the next united matrix be factorised."""
+        """Drop the factorisation, so that the next matrix is factorised."""
         self._pc = self._made_with = None
 
     def serves(self, P: Restriction, K: PETSc.Mat) -> bool:
-        """Whether K is nearly the same, and so are the unknowns but for a few (collective)."""
+        """Whether K is nearly unchanged, and all but a few of the used unknowns are the same (collective)."""
         changed: float = np.inf
         if self._made_with is not None:
             used, diagonal = self._made_with
@@ -70,7 +70,7 @@ class KeptFactor:
     def solve(
         self, P: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, rhs: PETSc.Vec, accuracy: float
     ) -> tuple[PETSc.Vec, int] | None:
-        """Unknowns that leave no more than the part ``accuracy`` of ``rhs``, and how many solves; None after too many (collective)."""
+        """Unknowns with a relative residual of at most ``accuracy``, and the number of solves; None after too many (collective)."""
         if self._pc is None:
             return None
         ksp = PETSc.KSP().create(self.space.comm)
@@ -87,7 +87,7 @@ class KeptFactor:
         with timed("linear solve"):
             ksp.solve(rhs, dq)
         found = (dq, int(ksp.getIterationNumber())) if ksp.getConvergedReason() > 0 else None
-        # P would live on with them
+        # otherwise P would be kept alive
         ksp.reset()
         ksp.destroy()
         A.destroy()
@@ -95,7 +95,7 @@ class KeptFactor:
 
 
 class _United:
-    """``P'(K + G)P`` as a map, of unknowns that are zero where columns of P are idle."""
+    """``P'(K + G)P`` as a map, for unknowns that are zero at idle columns of P."""
 
     def __init__(self, P: Restriction, K: PETSc.Mat, G: PETSc.Mat | None):
         self.P, self.K, self.G = P, K, G
@@ -107,7 +107,7 @@ class _United:
 
 
 class _Solves:
-    """Solves by a factorisation that is not to be made anew; unknowns that are not used ``(n_owned block,)`` stay zero."""
+    """Solves by an unchanged factorisation; idle unknowns ``(n_owned block,)`` are set to zero."""
 
     def __init__(self, pc: PETSc.PC, idle: Bools):
         self.pc, self.idle = pc, idle

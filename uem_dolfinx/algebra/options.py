@@ -1,4 +1,4 @@
-"""Options of PETSc for the united solve: those by size, and a look at those that users give."""
+"""Options of PETSc for the linear solves: defaults by size, and checks of users' options."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ FACTORISED_UP_TO = {2: 3_000_000, 3: 200_000}
 #: matrix in 3D, it does, or leaves the matrix to a factorisation that pays.
 #: [bound; iterations; test_linear_solver.py::test_gmres_gives_way]
 GMRES_RESTART = 100
-#: Errors of PETSc that say that it has no such type, or no such factorisation.
+#: Error codes of PETSc for an unknown type or factorisation.
 NO_SUCH_TYPE = (86, 92)
-#: Options that misspelt ones are likely to mean.
+#: Frequent options, suggested for misspelt ones.
 OFTEN_USED = (
     "ksp_type", "ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_norm_type", "ksp_gmres_restart", "ksp_monitor", "ksp_view", "pc_type",
     "pc_factor_mat_solver_type", "pc_hypre_type", "pc_gamg_threshold", "mg_levels_ksp_type", "mg_levels_pc_type", "sub_pc_type",
@@ -50,11 +50,11 @@ def has_mumps() -> bool:
 
 
 def default_options(size: int, gdim: int, mixed: bool = False) -> tuple[dict[str, Any], dict[str, Any]]:
-    """PETSc options for a united system with ``size`` unknowns, and those that take over where CG fails; none if empty.
+    """PETSc options for a constrained system with ``size`` unknowns, and options to use if CG fails, which may be empty.
 
-    MUMPS while it is cheap, else CG with AMG. MUMPS pivots in LDL' as well, PETSc's own Cholesky does not. In the plane it orders by
-    approximate minimum fill: PORD and METIS take four times as long to order, which is half of a factorisation's time or more, for
-    factors that take 10 to 20 % less. A ``mixed`` problem may be a saddle, which neither CG nor AMG is for: MUMPS at any size.
+    MUMPS if it is cheap, otherwise CG with AMG. MUMPS also pivots in LDL'; PETSc's own Cholesky does not. In 2D it orders by approximate
+    minimum fill: PORD and METIS take four times as long, half of a factorisation's time or more, for factorisations that are 10 to 20 %
+    cheaper. A ``mixed`` problem may be a saddle point problem, for which CG and AMG are unsuitable: MUMPS at any size.
     """
     direct: dict[str, Any] = {"ksp_type": "preonly", "pc_type": "lu"}
     if has_mumps():
@@ -69,10 +69,10 @@ def default_options(size: int, gdim: int, mixed: bool = False) -> tuple[dict[str
 
 
 def options_in_turn(options: Mapping[str, Any] | None, prefix: str, size: int, gdim: int, mixed: bool) -> list[dict[str, Any]]:
-    """PETSc options that are asked for first, those that take over where they fail or do not suit, and those where they fail.
+    """PETSc options used first, options used if these fail or do not fit the matrix, and options used if they fail.
 
-    Without any ``options``, here or for this ``prefix`` in PETSc's database, ``default_options`` are taken, and where these are
-    iterative, MUMPS up to ``FACTORISED_UP_TO`` unknowns where they fail.
+    Without ``options``, here or for this ``prefix`` in PETSc's database, these are ``default_options``, and, if they are iterative and
+    fail, MUMPS up to ``FACTORISED_UP_TO`` unknowns.
     """
     if options or (options is not None and PETSc.Options(prefix).getAll()):
         return [dict(options), {}, {}]
@@ -82,9 +82,9 @@ def options_in_turn(options: Mapping[str, Any] | None, prefix: str, size: int, g
 
 
 def multigrid_options(amg: str = "") -> dict[str, Any]:
-    """PETSc options of algebraic multigrid for elasticity: ``"hypre"``, ``"gamg"``, or hypre where PETSc has it.
+    """PETSc options of algebraic multigrid for elasticity: ``"hypre"``, ``"gamg"``, or by default hypre if PETSc has it.
 
-    Chebyshev smoothing acts alike on any number of ranks, and takes half of the time of Gauss-Seidel's.
+    Chebyshev smoothing is the same on any number of ranks, and takes half the time of Gauss-Seidel smoothing.
 
     Raises:
         InputError, InputTypeError: for another word.
@@ -92,7 +92,7 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
     given.word("amg", amg, ("hypre", "gamg", ""))
     amg = amg or ("hypre" if has_hypre() else "gamg")
     if amg == "gamg":
-        # the smoother's bounds from CG, which finds the few large eigenvalues that stiff contactors make
+        # the smoother's bounds from CG, which finds the few large eigenvalues due to stiff contactors
         gamg = {"esteig_ksp_type": "cg", "esteig_ksp_max_it": 20, "threshold": 0.02}
         smoother = {"mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi"}
         return {"pc_type": "gamg"} | smoother | {f"pc_gamg_{k}": v for k, v in gamg.items()}
@@ -103,17 +103,17 @@ def multigrid_options(amg: str = "") -> dict[str, Any]:
 
 
 def saddle_options(field: int = 1, amg: str = "") -> dict[str, Any]:
-    """PETSc options of GMRES for a displacement and a pressure: multigrid on the displacement's part of the united matrix.
+    """PETSc options of GMRES for a displacement and a pressure: multigrid on the displacement's part of the constrained matrix.
 
-    The pressure's Schur complement is replaced by the diagonal of that with the diagonal of the displacement's part, which is as large
-    as the pressure's mass over the shear modulus, wherever that changes.
+    The pressure's Schur complement is approximated by its diagonal, computed with the diagonal of the displacement's part. It has the
+    size of the pressure's mass over the shear modulus, also for variable moduli.
 
     Args:
         field: number of the pressure's part of the mixed space.
-        amg: as of ``multigrid_options``.
+        amg: as in ``multigrid_options``.
 
     Raises:
-        InputError, InputTypeError: for no number of a part, or another word.
+        InputError, InputTypeError: for an invalid number of a part, or another word.
     """
     field = given.part_number("field", field, "the pressure")
     schur = {"type": "schur", "schur_fact_type": "lower", "schur_precondition": "selfp"}
@@ -127,8 +127,8 @@ def check_options(options: Any, prefix: Any) -> None:
     """Refuse options and a prefix that PETSc could not read, and types of KSP and PC that it does not know.
 
     Raises:
-        InputTypeError, InputError: naming the option.
-        MissingBackendError: where one asks for a library PETSc was built without.
+        InputTypeError, InputError: names the option.
+        MissingBackendError: if an option needs a library that PETSc was built without.
     """
     given.kind("petsc_options_prefix", prefix, isinstance(prefix, str), "a text, as 'uem_'")
     if not re.fullmatch(r"(?!-)\S*", prefix):
@@ -153,14 +153,14 @@ def check_options(options: Any, prefix: Any) -> None:
 
 
 def check_fields(options: Any, names: Sequence[str]) -> None:
-    """Refuse options of field split for fields that there are not.
+    """Refuse options of field split for fields that do not exist.
 
     Args:
-        options: that users give, or None.
-        names: of the fields in PETSc's options, the displacement alone or it and others.
+        options: of users, or None.
+        names: of the fields in PETSc's options; only one for a displacement without other fields.
 
     Raises:
-        InputError: naming the option.
+        InputError: names the option.
     """
     known = ", ".join(repr(name) for name in names)
     for key, value in (options or {}).items():
@@ -183,7 +183,7 @@ def _type_names(of: Any) -> list[str]:
 
 
 def _knows(of: Any, name: Any) -> bool:
-    """Whether there is a type of KSP or PC of this name, built in or registered since."""
+    """Whether a type of KSP or PC of this name exists, built in or registered."""
     if name in _type_names(of):
         return True
     try:
@@ -194,7 +194,7 @@ def _knows(of: Any, name: Any) -> bool:
 
 
 def tell_unused(names: Iterable[str], options: Mapping[str, Any], types: str) -> None:
-    """Warn of options that PETSc with these types of KSP and PC has had no use for."""
+    """Warn of options that PETSc has not used with these types of KSP and PC."""
     for key in sorted(names):
         remedy = given.did_you_mean(key, OFTEN_USED, "check its spelling, or leave it out")
         logger.warning(
@@ -204,5 +204,5 @@ def tell_unused(names: Iterable[str], options: Mapping[str, Any], types: str) ->
 
 
 def last_words(error: PETSc.Error) -> str:
-    """What PETSc says about an error, without where in its sources."""
+    """The message of a PETSc error, without the position in PETSc's sources."""
     return str(error).splitlines()[-1].partition("] ")[2] or str(error)

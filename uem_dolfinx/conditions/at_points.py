@@ -1,4 +1,4 @@
-"""Forces and springs at nodes, which forms have no measure for."""
+"""Forces and springs at nodes, for which UFL forms have no measure."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class PointLoad(given.Sealed):
         P = fem.Constant(mesh, (0.0, 0.0)); uem.PointLoad((2.0, 1.0), P)      # with load={P: (0.0, -3.0)}
 
     Args:
-        at: tag of points, as a physical point of a ``.geo`` file, ``(meshtags, value)``, a list of these, or reference coordinates of a
-            node ``(gdim,)``.
-        force: numbers, or a ``fem.Constant``, which may change between steps and follow the load ``(gdim,)``; of axisymmetric bodies that
-            around the whole circle.
+        at: tag of points, e.g. a physical point of a ``.geo`` file, ``(meshtags, value)``, a list of these, or reference coordinates of
+            a node ``(gdim,)``.
+        force: numbers, or a ``fem.Constant``, which may change between steps and be set by the load ``(gdim,)``; in axisymmetry the
+            total force on the whole circle.
 
     Raises:
-        InputError, InputTypeError: for a force of another form, or, when the problem is made, a place where no node is; then a
-            TagError for a tag that is not of points.
+        InputError, InputTypeError: for a force of another form, or, when the problem is made, a place without a node. When the problem
+            is made also a TagError for a tag that is not of points.
     """
 
     SETTABLE: ClassVar = {"force": None}
@@ -47,27 +47,27 @@ class PointLoad(given.Sealed):
         return self.force.value if isinstance(self.force, fem.Constant) else self.force
 
     def given_values(self) -> dict[str, Any]:
-        """Its values as they are now, by name."""
+        """Its present values, by name."""
         return {"the place": self.at if is_point(self.at) else None, "the force": self._values}
 
     def force_and_stiffness(self, gdim: int) -> tuple[Array, Array | None]:
-        """Force ``(gdim,)`` as it is now, and stiffness ``(gdim, gdim)``, None without any."""
+        """Present force ``(gdim,)``, and stiffness ``(gdim, gdim)`` or None."""
         return given.vector("the force of a PointLoad", self._values, gdim), None
 
 
 class PointSpring(given.Sealed):
-    """A linear spring between a node, or each of several, and where it was drawn: the force on the node is ``-k u``.
+    """A linear spring between a node, or each of several, and its reference position: the force on the node is ``-k u``.
 
         uem.PointSpring(tags["foot"], 1e4)              # alike in all directions
         uem.PointSpring(tags["foot"], (0.0, 1e4))       # along y
 
     Args:
-        at: as of ``PointLoad``.
+        at: as in ``PointLoad``.
         stiffness: a number for all directions, numbers for each axis ``(gdim,)``, or a symmetric matrix without negative eigenvalues
             ``(gdim, gdim)``.
 
     Raises:
-        InputError, InputTypeError, TagError: as of ``PointLoad``.
+        InputError, InputTypeError, TagError: as in ``PointLoad``.
     """
 
     def __init__(self, at: Any, stiffness: npt.ArrayLike):
@@ -83,11 +83,11 @@ class PointSpring(given.Sealed):
             raise InputError(given.sentence("stiffness", stiffness, words))
 
     def given_values(self) -> dict[str, Any]:
-        """As of ``PointLoad``."""
+        """See ``PointLoad``."""
         return {"the place": self.at if is_point(self.at) else None, "the stiffness": self._k}
 
     def force_and_stiffness(self, gdim: int) -> tuple[Array, Array | None]:
-        """As of ``PointLoad``."""
+        """See ``PointLoad``."""
         k = self._k * np.eye(gdim) if self._k.ndim == 0 else np.diag(self._k) if self._k.ndim == 1 else self._k
         if k.shape != (gdim, gdim):
             raise InputError(given.sentence("the stiffness of a PointSpring", self._k, f"a number, or {gdim} for each axis"))
@@ -99,25 +99,25 @@ class AtPoints:
 
     Args:
         config: configuration of the displacement.
-        declared: as users declared them.
-        couplings: whose force and moment act at nodes, too; attached.
+        declared: loads and springs as declared by users.
+        couplings: attached; their forces and moments act at nodes, too.
     """
 
     def __init__(
         self, config: Configuration, declared: Sequence[PointLoad | PointSpring], couplings: Sequence[RigidCoupling] = ()
     ):
         self._config, self._couplings = config, list(couplings)
-        #: What was declared, each with its owned nodes, all of which differ.
+        #: Declared loads and springs, each with its distinct owned nodes.
         self.parts = [(one, nodes_at(config, one.at, f"the place of points[{i}]", (0,))) for i, one in enumerate(declared)]
         with agreed(config.comm):
             for one, _ in self.parts:
                 one.force_and_stiffness(config.gdim)
         n = len(config.whole.x.array)
-        #: Unknowns that the components of the nodes are ``(n_local, gdim)``.
+        #: Unknowns of the components of the nodes ``(n_local, gdim)``.
         self._unknowns = config.of(np.arange(n))
 
     def add_forces(self, b: AnyArray) -> None:
-        """Add what a residual, internal minus external forces, lacks at the owned unknowns ``(n,)`` (collective)."""
+        """Add forces of loads and springs to a residual, internal minus external forces, at the owned unknowns ``(n,)`` (collective)."""
         config = self._config
         for one, nodes in self.parts:
             force, k = one.force_and_stiffness(config.gdim)
@@ -126,7 +126,7 @@ class AtPoints:
             b[self._unknowns[coupling.nodes.nodes]] -= coupling.nodal_forces()
 
     def loads(self) -> Array:
-        """Forces but those of springs, at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        """Forces except spring forces, at the owned nodes ``(n_owned, gdim)`` (collective)."""
         found = np.zeros((self._config.n_owned, self._config.gdim))
         for one, nodes in self.parts:
             found[nodes] += one.force_and_stiffness(self._config.gdim)[0]
@@ -135,7 +135,7 @@ class AtPoints:
         return found
 
     def energy(self) -> float:
-        """Energy that the springs have stored (collective)."""
+        """Energy stored in the springs (collective)."""
         u, parts = (
             self._config.displacement,
             [(nodes, one.force_and_stiffness(self._config.gdim)[1]) for one, nodes in self.parts],

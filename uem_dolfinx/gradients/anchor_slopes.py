@@ -1,12 +1,12 @@
-"""How a step with friction depends on the anchors that it began with, and these on where contactors were before; backwards alone.
+"""Derivatives of a step with friction by its initial anchors, and of anchors by earlier positions of contactors; in reverse mode only.
 
-A contactor that sticks is at its anchor A, a point of the target, in all components,
+A sticking contactor coincides with its anchor A, a point of the target, in all components,
 
     x_i = A(xi) = sum_a N_a(xi) x_a,        A' = t xi',        t = sum_a dN_a x_a
 
-so that its equations' gaps change by ``-d . A'`` for a direction d, and its force f acts on the target's nodes with ``N_a + dN_a xi'``.
-The direction of one that slips in space changes with its way w from A by a stiffness S, ``tau' = -S w'``. An anchor of a contactor that
-does not stick is its foot, whose coordinates change with contactor and target as the derivative of the closest point has it.
+so that the gaps of its equations change by ``-d . A'`` for a direction d, and its force f acts on the target's nodes with
+``N_a + dN_a xi'``. In 3D the slip direction changes with the offset w from A by a stiffness S, ``tau' = -S w'``. The anchor of a contactor
+that does not stick is its closest point, with the derivatives of the projection.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class AnchorSlopes:
         name: of its contact, for messages.
 
     Attributes:
-        stuck: contactors at their anchors ``(n,)``.
+        stuck: mask of contactors at their anchors ``(n,)``.
 
     Raises:
-        InputError: where corners or edges of the target hold contactors, or slip turns that has no way.
+        InputError: for contactors held by corners or edges of the target, or with zero slip, whose direction is undefined.
     """
 
     def __init__(self, pair: Interface, name: str):
@@ -64,7 +64,7 @@ class AnchorSlopes:
             )
 
     def _turn_by_slip(self) -> None:
-        """Let directions turn by slip and force in equal parts, on which the stiffness of a turn does not depend in equilibrium."""
+        """Set directions that depend on slip and force in equal parts, which does not affect the stiffness S in equilibrium."""
         w, bound, state = self._sliding.frame.slip, self._sliding.bound(self._pair.trial), self._pair.trial
         way = np.linalg.norm(w, axis=1)
         self._refuse(self._slips & ((way == 0.0) | (bound == 0.0)), "slip without way or without force turns")
@@ -74,9 +74,9 @@ class AnchorSlopes:
         self._sliding.pivot = replace(self._sliding.pivot, stiffness=c, q=q)
 
     def leaning(self) -> list[tuple[Ints, Array]]:
-        """What Newton's tangent leaves out in space, lists of global nodes and blocks as of ``Interface.curvature``.
+        """Terms that Newton's tangent neglects in 3D, lists of global nodes and blocks as in ``Interface.curvature``.
 
-        A way w over a curved surface leans from the tangent plane, so that its part in that plane changes by ``- (n . w) n'``.
+        On a curved surface an offset w is inclined to the tangent plane, so that its part in that plane changes by ``- (n . w) n'``.
         """
         if self._config.gdim == 2:
             return []
@@ -89,11 +89,11 @@ class AnchorSlopes:
         return [(np.column_stack([self._config.to_global(self._pair.nodes[i]), p.nodes[i]]), blocks)]
 
     def without_stuck(self) -> PairState:
-        """The state in which contactors at their anchors have no force: they turn none of their equations."""
+        """The state with zero forces of contactors at their anchors, since their equations do not rotate."""
         return replace(self._pair.trial, nodal=np.where(self.stuck, 0.0, self._pair.trial.nodal))
 
     def _tangents_at_anchors(self) -> Array:
-        """Derivatives of the anchors ``(n, k, gdim)`` by what tells them (collective)."""
+        """Derivatives of the anchors ``(n, k, gdim)`` by their coordinates (collective)."""
         target, f = self._pair.target, self._pair.trial.friction
         assert f is not None
         if isinstance(target, MeshTarget):
@@ -104,7 +104,7 @@ class AnchorSlopes:
 
     @property
     def size(self) -> int:
-        """How many numbers tell an anchor."""
+        """Number of coordinates of an anchor."""
         return self._anchor.shape[1]
 
     def by_anchors(self, by_gaps: Array, equations: Constraints, a: Array) -> Array:
@@ -113,7 +113,7 @@ class AnchorSlopes:
         Args:
             by_gaps: derivative by the gaps of the pair's ``equations (m,)``.
             equations: of the pair.
-            a: of the adjoint problem, at the owned nodes ``(n_owned, gdim)``.
+            a: adjoint displacement at the owned nodes ``(n_owned, gdim)``.
         """
         pair, kinematics, n = self._pair, self._pair.kinematics, len(self._pair.nodes)
         pulled = np.zeros((n, self._config.gdim))
@@ -131,12 +131,12 @@ class AnchorSlopes:
         return found
 
     def back(self, by_anchors: Array, first: bool) -> tuple[Array, Array]:
-        """What derivatives by the anchors that the step ends with ``(n, k)`` are by places, and by the anchors it began with (collective).
+        """Derivatives by positions and by initial anchors, from derivatives by final anchors of the step ``(n, k)`` (collective).
 
-        ``first`` tells of the state before the first step, where all anchors are feet.
+        ``first``: for the state before the first step, in which all anchors are closest points.
 
         Returns:
-            By the places of the owned nodes ``(n_owned, gdim)``, and by the anchors that have not moved ``(n, k)``.
+            By the positions of the owned nodes ``(n_owned, gdim)``, and by the unchanged anchors ``(n, k)``.
         """
         f, pair = self._pair.trial.friction, self._pair
         assert f is not None
@@ -147,7 +147,7 @@ class AnchorSlopes:
             t, D = foot_slopes(p, i)
             off = np.einsum("kfg,kg->kf", t, pair.points[i] - p.foot[i])
             free = np.abs(off) <= ON_SIDE * np.einsum("kfg,kfg->kf", t, t)
-            # past an end, or over a convex edge, a foot stays where it is, or keeps to the edge
+            # past an end or over a convex edge, the closest point is fixed or moves along the edge
             if self._config.gdim == 3:
                 beyond = np.zeros(len(loose), dtype=bool)
                 beyond[i] = ~free.all(axis=1)

@@ -1,6 +1,6 @@
-"""Derivatives of forms by controls, differentiated and compiled once for all states that they are assembled at.
+"""Derivatives of forms by controls, differentiated and compiled once for all states.
 
-Beside them transposed matrices, and values of Functions in spaces that are numbered otherwise.
+Also transposed matrices, and values of Functions in spaces with another numbering.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 
-#: Forms whose derivatives are added up, each with its sign.
+#: Forms whose derivatives are summed, each with its sign.
 Terms = Sequence[tuple[ufl.Form, float]]
 
 
 class Derivatives:
-    """Derivatives of a residual's work along one field, and of functionals, at the present values of all they hold.
+    """Derivatives of a residual's work along one field, and of functionals, at the present values of their coefficients.
 
     Args:
         F: residual, in UFL.
         W: space of its test function.
-        V: of the displacement, by whose nodes places are told.
+        V: space of the displacement, with the nodes for derivatives by positions.
 
     Attributes:
-        F: likewise.
+        F: the residual.
         test: test function of F.
         a: the field, a Function of W.
         work: F along it, a functional.
@@ -39,21 +39,21 @@ class Derivatives:
         self.F, self.test, self.a, self._V = F, F.arguments()[0], fem.Function(W), V
         self.work = ufl.replace(F, {self.test: self.a})
         self._comm = V.mesh.comm
-        #: Compiled derivatives, None for those that vanish, with the form and the control that their keys number.
+        #: Compiled derivatives, None if they vanish, with the form and the control whose ids are in the keys.
         self._known: dict[tuple[Any, ...], tuple[Any, ufl.Form, Any]] = {}
         self._used: set[tuple[Any, ...]] = set()
 
     def begin(self) -> None:
-        """Go on with what has been asked for since this was called last, and forget the rest: functionals come and go."""
+        """Keep only derivatives that were used since the last call, since functionals change."""
         self._known, self._used = {key: self._known[key] for key in self._used}, set()
 
     def along(self, values: Array) -> None:
-        """Take the residual's work along a field with these owned values (collective)."""
+        """Set the owned values of the field a for the residual's work (collective)."""
         self.a.x.array[: len(values)] = values
         self.a.x.scatter_forward()
 
     def _compiled(self, form: ufl.Form, m: Any, make: Callable[[], ufl.Form | None], *which: Any) -> Any:
-        """A derivative by m, compiled when it is asked for first; None where the form does not depend on it."""
+        """A derivative by m, compiled on first use; None if the form does not depend on m."""
         key = id(form), id(m), *which
         if key not in self._known:
             found = make()
@@ -62,7 +62,7 @@ class Derivatives:
         return self._known[key][0]
 
     def by_values(self, form: ufl.Form, m: fem.Function, test: Any = None) -> Array | None:
-        """Derivative by the owned values of a Function, or along a test function of another space; None without any (collective)."""
+        """Derivative by the owned values of a Function, or along a given test function; None if it vanishes (collective)."""
         V = m.function_space if test is None else test.ufl_function_space()
         found = self._compiled(form, m, lambda: derivative(form, m, ufl.TestFunction(V) if test is None else test))
         return None if found is None else forms.assemble_array(V, found)
@@ -79,11 +79,11 @@ class Derivatives:
         return found
 
     def by_function(self, terms: Terms, m: fem.Function) -> fem.Function:
-        """Derivative by the values of a Function, one of its space (collective)."""
+        """Derivative by the values of a Function, a Function of its space (collective)."""
         return self._added(terms, fem.Function(m.function_space), lambda form: self.by_values(form, m))
 
     def by_places(self, terms: Terms, X: ufl.SpatialCoordinate) -> fem.Function:
-        """Derivative by the places of the nodes that integrals are taken over, a Function of V (collective)."""
+        """Derivative by the positions of the nodes in the domain of integration, a Function of V (collective)."""
         V = self._V
 
         def by(form: ufl.Form) -> Array | None:
@@ -101,14 +101,14 @@ class Derivatives:
 
 
 def transposed(A: PETSc.Mat) -> PETSc.Mat:
-    """A matrix of its own."""
+    """The transpose as a new matrix."""
     out = PETSc.Mat()
     A.transpose(out)
     return out
 
 
 def values_in(V: Any, f: fem.Function) -> Array:
-    """Local values of f as its element's space V numbers them: spaces made from parts of a mixed one are numbered otherwise."""
+    """Local values of f in the numbering of V, a space of the same element; spaces from parts of mixed ones have another numbering."""
     places = []
     for space in (V, f.function_space):
         block = space.dofmap.index_map_bs
@@ -119,12 +119,12 @@ def values_in(V: Any, f: fem.Function) -> Array:
 
 
 def derivative(form: ufl.Form, m: fem.Function, direction: Any) -> ufl.Form | None:
-    """Derivative of a form by a Function; None where it does not depend on it."""
+    """Derivative of a form by a Function; None if the form does not depend on it."""
     return forms.expanded(ufl.derivative(form, m, direction)) if m in form.coefficients() else None
 
 
 def along(form: ufl.Form, m: fem.Constant | fem.Function, change: Any) -> ufl.Form | None:
-    """Derivative of a form along a change of a Constant or a Function; None where it does not depend on it."""
+    """Derivative of a form along a change of a Constant or a Function; None if the form does not depend on it."""
     if isinstance(m, fem.Function):
         return derivative(form, m, change)
     if m not in form.constants():

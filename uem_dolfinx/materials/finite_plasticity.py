@@ -27,47 +27,47 @@ VARYING = {
 
 
 class FinitePlasticity(VonMises):
-    """Elasto-plasticity of von Mises at strains and rotations of any size, as in metal forming, with isotropic and kinematic hardening.
+    """Von Mises elasto-plasticity at large strains and rotations, e.g. metal forming, with isotropic and kinematic hardening.
 
         F = F_e F_p,    tau = kappa ln(J) 1 + 2 mu dev(ln V_e),    q(tau) <= yield stress at peeq
 
     with the Kirchhoff stress ``tau``, ``J = det F`` and the elastic stretch ``V_e``. The flow is integrated by the exponential map,
-    ``det F_p = 1`` to rounding, so that the radial return of small strains acts on the logarithmic strain; the result is hyperelastic
-    in ``F_e``, and no rigid rotation changes it. In small strains it is ``VonMises``, to second order in the strain.
+    ``det F_p = 1`` to rounding, so that the radial return of small strains acts on the logarithmic strain. The law is hyperelastic in
+    ``F_e`` and objective. For small strains it is equal to ``VonMises``, up to second order in the strain.
 
     With a number as ``kinematic_hardening`` the yield surface has its centre at a back stress, in the axes of F_p and V_e
 
         q(2 mu dev(ln U_e) - 2/3 kinematic_hardening ln V_p) <= yield stress at peeq
 
     with ``U_e^2 = F_e^T F_e`` and ``V_p^2 = F_p F_p^T``: Prager's rule, derived from an energy of ``V_p``. No plastic spin is
-    assumed; the history variables are ``peeq`` and the plastic strain. In simple shear the back stress grows up to a shear of 3 and
-    falls slowly beyond, as the logarithm of the stretch does, without oscillations. A table stands for layers that share F, as in
-    ``VonMises``, each with a plastic strain of its own: tension follows the table over the logarithmic plastic strain exactly, and
-    cycles follow Masing's rule.
+    assumed; the history variables are ``peeq`` and the plastic strain. In simple shear the back stress increases up to a shear of 3 and
+    then decreases slowly, like the logarithm of the stretch, without oscillations. A table represents layers with the same F, as in
+    ``VonMises``, and different plastic strains: tension follows the table over the logarithmic plastic strain exactly, and cycles
+    follow Masing's rule.
 
-    Volumes are treated as there, so that the same cells do not lock: what resists their change is integrated by a rule of its own,
-    with one point in quadrilaterals and hexahedra of degree 1; there, in axisymmetry, ``J`` is the ratio of the volumes of the cell's
-    rings. That part is an energy in ``J``, and the tangent is symmetric.
+    As in ``VonMises``, the volumetric part is integrated by a separate rule, so that the same cells do not lock, with one point in
+    quadrilaterals and hexahedra of degree 1; in axisymmetry ``J`` is then the volume ratio of the ring of the cell. This part is an
+    energy in ``J``, and the tangent is symmetric.
 
     Args:
-        u: displacement, a Function of a vector Lagrange space; with ``displacement`` a Function of a mixed space, as the problem's.
+        u: displacement, a Function of a vector Lagrange space; with ``displacement`` a Function of a mixed space, as in the problem.
         E: Young's modulus: a number or a DG0 Function, as the other parameters; read once.
         nu: Poisson's ratio.
         yield_stress: in uniaxial tension, force per present area times J; infinite where the body is elastic. Or a table: pairs
-            (equivalent plastic strain, yield stress), the strains from 0 upwards, with straight lines between.
+            (equivalent plastic strain, yield stress), with increasing strains from 0, and linear interpolation.
         hardening: increase of the yield stress per equivalent plastic strain, with a table beyond its last point; or ``Voce``.
-        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain; 0 is none. Or a table: pairs
-            (logarithmic plastic strain, back stress), as ``VonMises`` has it, without isotropic hardening.
-        displacement: number of the part of the mixed space that is the displacement.
-        kind: ``"3d"``, ``"plane_strain"``, or ``"axisymmetric"`` on a mesh that has been declared so.
-        cells: those made of this material, a tag or as ``Contact`` takes surfaces; may be none on some ranks. None is all cells.
-        quadrature_degree: of the stress; None chooses by cell and degree. The pressure's degree stays the smaller one.
+        kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain. Or a table: pairs (logarithmic plastic
+            strain, back stress), as in ``VonMises``, without isotropic hardening.
+        displacement: number of the displacement's part of the mixed space.
+        kind: ``"3d"``, ``"plane_strain"``, or ``"axisymmetric"`` on a mesh declared axisymmetric.
+        cells: cells of this material, a tag or as surfaces in ``Contact``; may be empty on some ranks. None is all cells.
+        quadrature_degree: of the stress; None chooses by cell and degree. The degree of the pressure is not larger.
 
     Attributes:
-        stress: Cauchy stress at quadrature points, as of the last ``update``, with the components of ``Returned``.
-        plastic_strain: ``(1 - C_p^-1) / 2`` there, as committed; ``cell_averages`` give ``ln(C_p) / 2``.
-        peeq: equivalent plastic strain there, as committed; with a table both are those of the layers, as in ``VonMises``.
-        history: the committed Functions by name, all that the material remembers.
+        stress: Cauchy stress at quadrature points, from the last ``update``, with the components of ``Returned``.
+        plastic_strain: committed ``(1 - C_p^-1) / 2`` there; ``cell_averages`` return ``ln(C_p) / 2``.
+        peeq: committed equivalent plastic strain there; with a table both contain values of all layers, as in ``VonMises``.
+        history: the committed Functions by name, the complete history.
 
     Raises:
         InputError, InputTypeError: for an unknown word, or a parameter out of its range.
@@ -111,13 +111,13 @@ class FinitePlasticity(VonMises):
         """Functions at the quadrature points, zero outside of this material's cells."""
         self._create_history()
         count = len(VARYING[self.kind][0])
-        # what the forms hold: the deviator's first Piola-Kirchhoff stress, and the upper triangle of its derivative by F
+        # Functions in the forms: the deviator's first Piola-Kirchhoff stress, and the upper triangle of its derivative by F
         self._piola = self._points.create_function("first_piola", count)
         self._upper = self._points.create_function("tangent", count * (count + 1) // 2)
         self._own(self.stress, self._piola, self._upper, *self.history.values())
 
     def _compile(self) -> None:
-        """Prepare the displacement's gradient at the points of stress, and ln J at those of pressure."""
+        """Compile the displacement's gradient at the stress points, and ln J at the pressure points."""
         self._strain = self._points.compile(self._components(self._moved))
         self._volume_change = self._pressure_points.compile(ufl.ln(self._volume_ratio()))
 
@@ -127,20 +127,20 @@ class FinitePlasticity(VonMises):
         return ufl.as_matrix([[G[0, 0], G[0, 1], 0], [G[1, 0], G[1, 1], 0], [0, 0, 0]]) if self.kind == "plane_strain" else G
 
     def _components(self, w: Any) -> Expr:
-        """Those of a gradient that vary."""
+        """Varying components of a gradient."""
         G = self._gradient(w)
         return ufl.as_vector([G[i, j] for i, j in np.transpose(VARYING[self.kind]).tolist()])
 
     @property
     def _of_rings(self) -> bool:
-        """Whether changes of volume are those of the rings that cells stand for, each told at its cell's centre."""
+        """Whether volume ratios are those of the rings of cells, evaluated at one point per cell."""
         return self.kind == "axisymmetric" and not self._pressure_points.degree
 
     def _volume_ratio(self) -> Expr:
-        """J; of rings, present over reference volume, exact if the cell is a parallelogram.
+        """J; for rings the present volume over the reference volume, exact if the cell is a parallelogram.
 
-        A ring's volume is the integral of ``2 pi r`` and the area. Over such a cell both ``r`` and the ratio of areas are linear in
-        each coordinate, and the mean of their product is that at the centre and the product of their slopes along the sides over 12.
+        A ring's volume is the integral of ``2 pi r`` over the cell's area. In a parallelogram ``r`` and the ratio of areas are linear in
+        each coordinate; the mean of their product is its value at the centre plus the product of their slopes along the sides over 12.
         """
         F = ufl.Identity(3) + self._gradient(self._moved)
         if not self._of_rings:
@@ -159,7 +159,7 @@ class FinitePlasticity(VonMises):
         return (grown * F[2, 2] + area * G[2, 2] + slopes / r) / self._volume_ratio()
 
     def _mean_of_slopes(self, a: Expr, b: Expr) -> Expr:
-        """What the mean over a parallelogram of a product has beyond the product of the means."""
+        """Mean of a product over a parallelogram minus the product of the means."""
         A = ufl.Jacobian(self.mesh)
         return ufl.dot(ufl.dot(ufl.grad(a), A), ufl.dot(ufl.grad(b), A)) / 12
 
@@ -170,7 +170,7 @@ class FinitePlasticity(VonMises):
         return ufl.dot(self._piola, self._components(v)) * self._points.dx + pressed
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
-        """The deviator's part of the tangent, which ``ufl.derivative(residual(v), u)`` cannot see; see ``VonMises.stiffness``."""
+        """The deviator's part of the tangent, missing in ``ufl.derivative(residual(v), u)``; see ``VonMises.stiffness``."""
         du, v = self._part(du), self._part(v)
         count = len(VARYING[self.kind][0])
         number = np.zeros((count, count), int)
@@ -210,7 +210,7 @@ class FinitePlasticity(VonMises):
         return kinematic_return(*before, self._curve, self._modulus, varying)
 
     def _plastic_strains(self) -> Array:
-        """``ln(C_p) / 2`` as committed ``(n_points, size)``."""
+        """Committed ``ln(C_p) / 2`` ``(n_points, size)``."""
         values, _ = self._committed()
         change, axes = np.linalg.eigh(to_tensors(values))
         strains = -np.log1p(-2 * change) / 2

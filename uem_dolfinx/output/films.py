@@ -1,4 +1,4 @@
-"""Films of runs: what a drawing needs is taken at each step, and drawn when the run has ended."""
+"""Films of runs: data are collected at each step, and drawn at the end of the run."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def animate(
 
     Args:
         path: name of the film, which ends in ``.gif`` or ``.mp4``; its folder is made.
-        problem: the scene.
+        problem: the problem.
         steps: ``load_steps`` or ``time_steps`` of the problem, or another iterator that solves steps.
-        every: draw one of so many steps, beginning with the first.
-        frames_per_second: how fast it is shown.
+        every: draw every n-th step, starting with the first.
+        frames_per_second: speed of the film.
         size: width and height in inches, of 100 points each.
         how: arguments of :func:`plot_scene`. A Function in an expression is evaluated at each step; pass a contact to draw its
             pressure at each step.
@@ -59,7 +59,7 @@ def animate(
 
     Raises:
         InputError, InputTypeError: for another ending, or an argument that ``plot_scene`` does not know or refuses.
-        MissingBackendError: before the run, if matplotlib cannot be imported, in 3D PyVista, for ``.mp4`` if there is no ffmpeg.
+        MissingBackendError: before the run, if matplotlib, in 3D PyVista, or for ``.mp4`` ffmpeg is missing.
         OutputError: if the film cannot be written: before the run if its folder cannot be made, or at its end.
     """
     path = given_path("path", path, problem.comm)
@@ -86,7 +86,7 @@ def _film(path: Path, drawing: Drawing, steps: Iterable[T], every: int, rate: fl
                 frames.append(drawing.take(_state(number, step)))
             yield step
     except BaseException:
-        # ranks may leave the loop at different times: nothing here is collective
+        # ranks may leave the loop at different times, so that nothing here may be collective
         try:
             _write(path, drawing, frames, rate, size)
         except Exception as error:
@@ -100,7 +100,7 @@ def _film(path: Path, drawing: Drawing, steps: Iterable[T], every: int, rate: fl
 
 
 def _state(number: int, step: object) -> tuple[str, float]:
-    """What tells the state after a step from others: a word and a number."""
+    """Label of the state after a step: a word and a number."""
     if isinstance(step, TimeStep):
         return "time", step.time
     if isinstance(step, LoadStep):
@@ -109,7 +109,7 @@ def _state(number: int, step: object) -> tuple[str, float]:
 
 
 def titles(states: list[tuple[str, float]]) -> list[str]:
-    """Words and numbers of states, with as few digits, but three, as tell different ones apart."""
+    """Words and numbers of states, with at least three digits, and enough to distinguish different states."""
     for digits in range(3, 17):
         found = [f"{word} {number:.{digits}g}".strip() for word, number in states]
         if len(set(found)) == len(set(states)):
@@ -118,7 +118,7 @@ def titles(states: list[tuple[str, float]]) -> list[str]:
 
 
 def _prepare(path: Path) -> None:
-    """Look, before the run, whether its film can be drawn and written."""
+    """Check, before the run, that its film can be drawn and written."""
     new_canvas(f"the film {path}", (1.0, 1.0))
     from matplotlib.animation import FFMpegWriter
 

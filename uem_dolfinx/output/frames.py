@@ -1,4 +1,4 @@
-"""What a drawing needs of a scene, gathered to rank 0 for drawing alone: vertices, facets, a field and contact forces."""
+"""Data of drawings, gathered to rank 0: vertices, facets, a field and contact forces."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ AROUND = {2: [0, 1], 3: [0, 1, 2], 4: [0, 1, 3, 2]}
 
 @dataclass(frozen=True)
 class Pieces:
-    """What is coloured, on rank 0: triangles of a 2D scene, or facets of a 3D one.
+    """Coloured polygons, on rank 0: triangles of cells in 2D, surface facets in 3D.
 
     Attributes:
-        faces: vertices of each ``(n, 3)``, in 3D also ``(n, 4)``, in the order of a frame's.
+        faces: vertices of each ``(n, 3)``, in 3D also ``(n, 4)``, as numbers in ``Frame.x``.
         edges: vertices around each cell of a 2D scene, closed ``(n_cells, 4 or 5)``; empty in 3D.
     """
 
@@ -47,9 +47,9 @@ class Frame:
         x: displaced vertices ``(n, gdim)``.
         values: of the field there ``(n,)``.
         forces: positions, forces and pressures of the contactors, one for each contact.
-        state: what tells which state it is, a word and a number.
-        cuts: triangles ``(k, 3, 3)`` in which the window cuts the bodies of a 3D scene, and the field at their corners ``(k, 3)``.
-        rigid: rigid targets where they are.
+        state: label of the state, a word and a number.
+        cuts: triangles ``(k, 3, 3)`` of sections of the bodies by the window, in 3D, and the field at their corners ``(k, 3)``.
+        rigid: rigid targets at their present positions.
     """
 
     x: Array
@@ -61,16 +61,16 @@ class Frame:
 
 
 class Gathering:
-    """Takes frames of a scene (making one is collective).
+    """Collects frames of a problem (the constructor is collective).
 
     Args:
-        problem: the scene.
-        field: what colours it, see ``vertex_values``.
+        problem: the problem.
+        field: for the colours, see ``vertex_values``.
         scale: magnification of the displacement.
-        arrows: whether contact forces are wanted.
-        surface: facets of a 3D scene that are wanted; None takes the whole outside.
-        window: bounds of what is wanted ``(gdim, 2)``, where bodies of a 3D scene are cut; None cuts nothing.
-        rigid: whether rigid targets are wanted.
+        arrows: whether to collect contact forces.
+        surface: facets to collect in 3D; None collects the whole surface.
+        window: bounds of the visible part ``(gdim, 2)``, where bodies are cut in 3D; None cuts nothing.
+        rigid: whether to collect rigid targets.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Gathering:
         self.problem, self.field, self.scale, self.arrows, self.rigid = problem, field, scale, arrows, rigid
         mesh = problem.config.mesh
         solid = problem.config.gdim == 3 and surface is None and window is not None
-        #: Where bodies are cut, and their cells.
+        #: Planes of sections, and the cells of the bodies.
         self._planes = (
             [(axis, bound) for axis, ends in enumerate(window) for bound in ends] if solid and window is not None else []
         )
@@ -119,8 +119,8 @@ def vertex_values(problem: UnitedProblem, field: Any) -> Array:
     """A field at the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts,)`` (collective).
 
     Args:
-        problem: the scene.
-        field: None for the size of the displacement, or a scalar u itself; a contact or several for their pressure; a scalar Lagrange
+        problem: the problem.
+        field: None for the magnitude of the displacement, or for a scalar u; a contact or several for their pressure; a scalar Lagrange
             Function; or any other scalar UFL expression, which is averaged over the cells around a vertex.
     """
     mesh = problem.config.mesh
@@ -176,7 +176,7 @@ def vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
 
 
 def boundary(mesh: Any, surface: Part | None = None) -> Ints:
-    """Owned facets on the outside, or those of a part that lie there, by d.o.f. of the P1 space (collective).
+    """Owned exterior facets, optionally only of a part, by d.o.f. of the P1 space (collective).
 
     Returns:
         Vertices in their order around each facet ``(n, n_vertices)``.
@@ -198,15 +198,15 @@ def boundary_and_cells(mesh: Any, surface: Part | None = None) -> tuple[Ints, In
 
 
 def outline(problem: UnitedProblem, scale: float = 1.0) -> Array | None:
-    """Where the bodies of a 2D scene end now: segments ``(n, 2, 2)`` on rank 0, None elsewhere (collective).
+    """Deformed boundary of the bodies in 2D: segments ``(n, 2, 2)`` on rank 0, None elsewhere (collective).
 
     Args:
-        problem: the scene.
+        problem: the problem.
         scale: magnification of the displacement.
 
     Raises:
-        InputTypeError: if it is no problem, or the scale no number.
-        InputError: for a 3D scene, whose bodies end in no line.
+        InputTypeError: for an object that is no problem, or a scale that is no number.
+        InputError: in 3D.
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
@@ -221,7 +221,7 @@ def gather_contactors(contact: Contact, scale: float) -> tuple[Array, Array, Arr
     """Positions, displaced by ``scale`` times the displacement, forces and pressures of all contactors on rank 0 (collective)."""
     config, nodes = contact.config, contact.pair.nodes
     at = config.X[nodes] + scale * config.displacement[nodes]
-    # points have no area; their forces stand for themselves
+    # points have no area: forces instead of pressures
     size = contact.pressures if contact.contactor.dim else contact.pair.trial.nodal
     parts = config.comm.gather((at, contact.pair.trial.force, size)) or [(at[:0], at[:0], np.zeros(0))]
     return tuple(np.concatenate(columns) for columns in zip(*parts))  # type: ignore[return-value]

@@ -1,6 +1,6 @@
-"""What a run goes on from: Functions, the states of contacts and numbers, each in the order of the mesh's input.
+"""State of a run for restarts: Functions, states of contacts and numbers, in the input order of the mesh.
 
-The state of a run is collected here; checkpoints write and read it.
+Checkpoints write and read it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_fingerprint, n_cells, node_numbering
 
-#: In words, an item of ``State.motions()``.
+#: Description of an item of ``State.motions()`` in messages.
 A_MOTION = "what motions() of a state returned: None, or where a rigid surface is, as a dict"
 #: Sides of a cell are fewer.
 #: [format; sides; -]
@@ -31,19 +31,19 @@ MOST_SIDES = 8
 
 
 class Entry(Protocol):
-    """Something with one row of numbers for each of its nodes."""
+    """Data with one row of numbers for each node."""
 
     name: str
     numbering: Numbering
 
     def describe(self) -> str:
-        """What tells it from others (collective)."""
+        """Description, which is compared on reading (collective)."""
 
     def to_checkpoint(self) -> AnyArray:
         """Values at this rank's nodes ``(n, ...)`` (collective)."""
 
     def from_checkpoint(self, kept: AnyArray) -> None:
-        """Put values back (collective)."""
+        """Restore the values (collective)."""
 
 
 class FunctionEntry:
@@ -69,7 +69,7 @@ class FunctionEntry:
 
 
 class ContactEntry:
-    """The committed states of a contact, one of a problem's with its number from 1, in a numbering of the displacement's nodes."""
+    """The committed states of a contact, with its number in the problem from 1, in a numbering of the displacement's nodes."""
 
     def __init__(self, number: int, contact: Contact, nodes: Numbering):
         self.name, self.contact = f"contact {number} '{contact.name}'", contact
@@ -84,7 +84,7 @@ class ContactEntry:
         self._columns = " ".join(self.to_checkpoint().dtype.names or ())
 
     def describe(self) -> str:
-        """Size, the surfaces, and what is remembered of a contactor."""
+        """Number of contactors, fingerprint of the surfaces, and data of each contactor."""
         return f"{self.numbering.total} contactors, surfaces {self._surfaces}, each with {self._columns}"
 
     def to_checkpoint(self) -> AnyArray:
@@ -96,27 +96,27 @@ class ContactEntry:
         return rows
 
     def from_checkpoint(self, kept: AnyArray) -> None:
-        """Hand the records to the pair."""
+        """Restore the states of the pair."""
         self.contact.pair.from_checkpoint({name: kept[name] for name in kept.dtype.names or ()})
 
 
 @dataclass
 class State(given.Sealed):
-    """State from which a run can continue; the order of the mesh's input is found when it is first written or read, and kept.
+    """State from which a run can continue; the input order of the mesh is determined at the first write or read.
 
     Attributes:
-        mesh: on which everything lives.
+        mesh: of all functions and contacts.
         functions: by name: Lagrange of degree 1 or 2, discontinuous Lagrange or quadrature, with values of any shape.
-            None may be added after the first writing or reading.
-        contacts: of a problem; their committed states are kept, and where their rigid surfaces are.
-        numbers: by name, whatever JSON can hold, floats to the last bit. Names are the same when it is written and read.
-        collect: called on all ranks before writing and reading, to bring functions and numbers up to date.
+            Functions must not be added after the first write or read.
+        contacts: of a problem; their committed states and the motions of their rigid surfaces are stored.
+        numbers: by name, any values that JSON can hold, floats to the last bit. Names must be the same on writing and reading.
+        collect: called on all ranks before writing and reading, to update functions and numbers.
         restore: called on all ranks after reading, to continue from them.
-        back: called on all ranks where a run ends by an error within a step, to return to the last step that is done. Without any, a
-            loop of the script's own that ends by an error writes nothing.
-        settings: settings of the run, by name; a file of other settings is refused, unless there are none on either side.
-        by_default: names of settings that have their default value; a file without them is not refused.
-        steps: that a ``Checkpoint`` has counted, so that it writes at the same ones whether the run is interrupted or not.
+        back: called on all ranks if an error ends a run within a step, to return to the last completed step. If empty, a loop of the
+            script that ends by an error writes nothing.
+        settings: settings of the run, by name; a file with other settings is refused, unless either has no settings.
+        by_default: names of settings with default values; a file without them is not refused.
+        steps: counted by a ``Checkpoint``, so that an interrupted run writes at the same steps as an uninterrupted one.
     """
 
     SETTABLE: ClassVar = dict.fromkeys(
@@ -150,7 +150,7 @@ class State(given.Sealed):
 
     @cached_property
     def entries(self) -> list[Entry]:
-        """Everything with a row for each node, in the order of the file (collective)."""
+        """All data with a row for each node, in the order of the file (collective)."""
         known: dict[int, tuple[Any, Numbering]] = {}
 
         def numbering(V: Any) -> Numbering:
@@ -162,22 +162,22 @@ class State(given.Sealed):
         return [*nodal, *(ContactEntry(i, contact, numbering(contact.config.V)) for i, contact in enumerate(self.contacts, 1))]
 
     def describe(self) -> dict[str, str]:
-        """What tells this state from others, in the order in which it is compared (collective)."""
+        """Description of the state, in the order of comparison (collective)."""
         cells = f"{n_cells(self.mesh)} {compat.cell_name(self.mesh)} cells in {self.mesh.geometry.dim}D"
         described = {"mesh": f"{cells}, fingerprint {self.fingerprint}", **{e.name: e.describe() for e in self.entries}}
         return described | {f"number '{name}'": "a value" for name in self.numbers}
 
     def motions(self) -> list[dict[str, Any] | None]:
-        """Where the contacts' rigid surfaces have been moved to."""
+        """Motions of the contacts' rigid surfaces."""
         motions = [contact.pair.target.motion for contact in self.contacts]
         return [None if m is None else {f.name: getattr(m, f.name).tolist() for f in fields(Motion)} for m in motions]
 
     def move(self, motions: list[dict[str, Any] | None]) -> None:
-        """Put the contacts' rigid surfaces where they were.
+        """Restore the motions of the contacts' rigid surfaces.
 
         Raises:
-            InputTypeError: for what ``motions`` does not return.
-            InputError: for those of another number of contacts.
+            InputTypeError: for objects that ``motions`` does not return.
+            InputError: for a wrong number of motions.
         """
         names = {f.name for f in fields(Motion)}
         given.items("motions", motions, lambda m: m is None or (isinstance(m, dict) and set(m) <= names), A_MOTION)

@@ -1,10 +1,10 @@
-"""How rigid bodies move under their loads until contact holds them: a quadratic programme of 3 or 6 unknowns a body.
+"""Motion of rigid bodies under their loads until contact holds them: a quadratic programme of 3 or 6 unknowns a body.
 
-With pseudo-masses M that let each body go as far as it may in a step, forces f, and gaps g with derivatives R, the increment v is that of
+With pseudo-masses M that limit the motion of each body in a step, forces f, and gaps g with derivatives R, the increment v solves
 
     min 1/2 v' M v - f' v   subject to   g + R v >= 0        (Gauss' principle of least constraint, from rest)
 
-and ``M v = f + R' lam`` with the contact forces ``lam >= 0``. Where contact forces balance f, v vanishes, whatever M is.
+and ``M v = f + R' lam`` with the contact forces ``lam >= 0``. If contact forces balance f, v vanishes for any M.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ def weighted(basis: Any, M: Array) -> Any:
 
 
 def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array, likely: Bools | None = None) -> tuple[Array, Array]:
-    """Solve the programme among the motions ``v = B x``; rows that those which bear do not keep are added until none is left (collective).
+    """Solve the programme for motions ``v = B x``; violated rows are added until there are no more (collective).
 
-    Bodies that the rows do not couple are programmes of their own.
+    Bodies that the rows do not couple are solved separately.
 
     Args:
         comm: communicator.
         f: forces, the same on all ranks ``(n,)``.
-        B: motions that conditions leave open, of ``weighted``.
+        B: motions that conditions leave open, from ``weighted``.
         R: derivatives of this rank's gaps, a sparse matrix ``(m, n)``.
-        g: this rank's gaps ``(m,)``; what is negative is brought to zero where that can be.
-        likely: rows to begin with, as those that bore before ``(m,)``; None for none.
+        g: this rank's gaps ``(m,)``; negative gaps are closed to zero if possible.
+        likely: mask of initial rows, e.g. rows with forces before ``(m,)``, or None.
 
     Returns:
         v ``(n,)``, the same on all ranks, and the contact forces of this rank's gaps ``(m,)``.
     """
     from scipy.sparse import vstack
 
-    # in the coordinates x it is the point of a polyhedron that is nearest to p
+    # in the coordinates x the solution is the point of a polyhedron nearest to p
     p = x = np.asarray(B.T @ f)
     G, length = (R @ B).tocsr(), _lengths(R)
-    # rounding couples no bodies, and stops no motion
+    # coefficients of the size of rounding are removed, so that they do not couple bodies
     G.data[np.abs(G.data) <= NEGLIGIBLE * np.repeat(length, np.diff(G.indptr)) * _lengths(B.T)[G.indices]] = 0.0
     G.eliminate_zeros()
     idle, alike, been = _lengths(G) == 0, _same_columns(R), np.zeros(len(g), dtype=bool)
-    # rows of all ranks that the point is found with, gaps, whose they are, which, and whether they stay, and forces
+    # rows of all ranks in use, their gaps, owners, numbers, whether they are permanent, and forces
     rows, gaps, whose, lam = G[:0], g[:0], np.zeros((0, 3), np.int64), np.zeros(0)
     while True:
         v = B @ x
@@ -68,7 +68,7 @@ def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array, likely: Boo
         slack = np.where(idle, 0.0, g + R @ v)
         slack[own] = 0.0
         broken = np.flatnonzero(slack < -KEPT * np.abs(v).max(initial=0.0) * length)
-        # of rows of the same bodies that which is broken most
+        # of rows of the same bodies the most violated one
         broken = broken[np.argsort(slack[broken] / length[broken], kind="stable")]
         worst = broken[np.unique(alike[broken], return_index=True)[1]]
         if likely is not None:
@@ -80,12 +80,12 @@ def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array, likely: Boo
             push = np.zeros(len(g))
             push[own] = lam[whose[:, 0] == comm.rank]
             return v, push
-        # rows that bear nothing may go: the point is farther from p each time; those that come back stay
+        # rows without force are dropped, since the distance from p increases each time; rows that are added again become permanent
         kept = (lam > 0) | (whose[:, 2] > 0)
         rows = vstack([rows[kept], *(r for r, _, _ in new)]).tocsr()
         gaps = np.concatenate([gaps[kept], *(h for _, h, _ in new)])
         whose = np.concatenate([whose[kept], *(t for _, _, t in new)])
-        # couplings by several rows must not cancel
+        # absolute values, since couplings by several rows must not cancel
         block, _, _ = blocks_of(abs(rows).T @ abs(rows))
         of, x, lam = block[rows.indices[rows.indptr[:-1]]], p.copy(), np.zeros(len(gaps))
         for b in np.unique(of):
@@ -99,7 +99,7 @@ def _lengths(R: Any) -> Array:
 
 
 def _same_columns(R: Any) -> Any:
-    """A number that rows of a sparse matrix ``(m, n)`` with the same first and last column have in common ``(m,)``."""
+    """A number for each row of a sparse matrix ``(m, n)``, equal for rows with the same first and last column ``(m,)``."""
     columns = np.append(R.indices, 0).astype(np.int64)
     return columns[R.indptr[:-1]] * R.shape[1] + columns[R.indptr[1:] - 1]
 
@@ -108,14 +108,14 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
     """The point ``x = p + G' lam`` nearest to ``p (k,)`` with ``G x >= h``, ``G (m, k)``, and ``lam (m,)``.
 
     Least distance programming by bounded least squares (Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23).
-    Rows that contradict each other are asked for no more than the origin fulfils.
+    If rows contradict each other, their bounds are relaxed to values that the origin satisfies.
     """
     size = np.linalg.norm(G, axis=1)
     scale = float(np.linalg.norm(p)) + float(np.abs(h / size).max(initial=0.0))
     if scale == 0:
         return p, np.zeros(len(h))
     unit = G / size[:, None]
-    # the first is quick, but not in every SciPy accurate to rounding; the second keeps its bounds to rounding
+    # nnls is fast, but not accurate to rounding in every SciPy; lsq_linear satisfies its bounds to rounding
     for quick, bound in ((True, h), (False, h), (False, np.minimum(h, 0.0))):
         d = (bound / size - unit @ p) / scale
         lam = _nonnegative(np.vstack([unit.T, d]), quick)
@@ -123,7 +123,7 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
         if left <= KEPT:
             continue
         lam *= scale / left
-        # to rounding, with the rows that bear; one more than there are unknowns, by rounding, would make them contradict each other
+        # refined to rounding with the rows with forces, by least squares, since rounding may add more rows than there are unknowns
         i = np.flatnonzero(lam > KEPT * lam.max(initial=0.0))
         exact = np.zeros(len(lam))
         exact[i] = scale * np.linalg.lstsq(unit[i] @ unit[i].T, d[i], rcond=None)[0]
@@ -143,7 +143,7 @@ def _nonnegative(E: Array, quick: bool) -> Array:
 
     e, most = np.append(np.zeros(len(E) - 1), 1.0), 30 * E.shape[1]
     if quick:
-        # it gives up after too many iterations
+        # nnls raises after too many iterations
         with suppress(RuntimeError):
             return np.asarray(nnls(E, e, maxiter=most)[0])
     return np.maximum(lsq_linear(E, e, (0.0, np.inf), "bvls", 1e-15, max_iter=most).x, 0.0)
