@@ -1,9 +1,8 @@
-"""Mortar: uniting equations from integrals over segments, exact on any pair of meshes.
+"""Mortar: constraint equations from integrals over segments, exact on any pair of meshes.
 
-Where a node's part of the contactor is covered by the target, its equation says that the gap vanishes in the mean, weighted with the
-node's dual function. The equations eliminate one component of the node each, like those of ``node_to_surface``; their multipliers
-are pressures, and the nodal forces balance in force and moment. Nodes that are farther from the target than a facet, until they come
-nearer, and corners whose facets do not face it, have the equation of a node against the surface.
+For a node whose part of the contactor is covered, the mean gap, weighted with the node's dual function, is zero. The equations
+eliminate one component of each node, as in ``node_to_surface``. Multipliers are pressures, and nodal forces balance in force and
+moment. Nodes farther from the target than a facet, and corners whose facets do not face it, have node-to-surface equations.
 """
 
 from __future__ import annotations
@@ -56,21 +55,21 @@ class Mortar(Contactors):
     chained, two_pass = True, False
     pointwise = False
 
-    #: Whether the last rows were made when no facets had faced each other in the step.
+    #: Whether the last rows were made before any facets had faced each other in the step.
     _afresh = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
         super().__init__(config, nodes, target, surface=surface, **how)
-        # tells equal nodes apart, alike in any partition
+        # distinguishes equal nodes, independent of the partition
         nn = surface.dofs.shape[1]
         code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
         self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
-        #: The last search that rows were made from, the contactors with averaged normals and what covered them before, and the rows; a
-        #: search finds the same object as long as nothing moves.
+        #: Rows of the last placement, with the search and the states of contactors that they depend on; a search returns the same
+        #: object while no node moves.
         self._united: tuple[Projection, Ints, WeightedRows] | None = None
-        #: Rows that a contact with small or fixed sliding keeps.
+        #: Kept rows of a contact with small or fixed sliding.
         self._kept: WeightedRows | None = None
-        #: Motion of a rigid target when they were made.
+        #: Motion of a rigid target at the time of these rows.
         self._kept_at: Motion | None = None
 
     # -- placement -------------------------------------------------------------------------------------------------------
@@ -94,7 +93,7 @@ class Mortar(Contactors):
             rows = self._unite(nearest, points, np.zeros(self.surface.dofs.shape, dtype=bool))
             self._kept, self._kept_at = rows, self.target.motion
             if self.offset is not None and not self.target.n_nodes:
-                # of heights over a rigid surface, which offsets are taken from anew
+                # keep heights over a rigid surface, from which present offsets are subtracted
                 self._kept = replace(
                     rows, equations=replace(rows.equations, gap=rows.equations.gap + self._weighted_offset(rows))
                 )
@@ -112,21 +111,21 @@ class Mortar(Contactors):
         return MortarKinematics(self, points, seen, nearest, gap, rows, movable)
 
     def _can_move(self, equations: UnitingEquations) -> Bools:
-        """Contactors whose equations follow anything that can move (collective)."""
+        """Contactors whose equations contain a free component of a followed node (collective)."""
         free = self.config.ask_owners(equations.followed, self.free_of_owned.astype(float))
         can = np.zeros(len(equations), dtype=bool)
         can[equations.row[np.abs(equations.coefficients * free).max(axis=1, initial=0.0) > MOSTLY_PRESCRIBED]] = True
         return can
 
     def _follow(self, rows: WeightedRows, nearest: Projection) -> WeightedRows:
-        """The same rows where contactors and target are now (collective)."""
+        """The kept rows in the current configuration (collective)."""
         eq, n = rows.equations, self.config.n_owned
         if self.target.n_nodes:
             gap = self._along(eq, self.config.x[:n])
         else:
             assert self.anchor is not None
             eq = self._turned(eq)
-            # what the nodes have come nearer, as a displacement along the rows
+            # change of height as a displacement along the rows
             lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
             way = np.zeros((n, self.config.gdim))
             way[self.nodes] = ((nearest.height - self.anchor.height) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
@@ -141,7 +140,7 @@ class Mortar(Contactors):
         return GapRows.along_normals(self.config, equations, np.ones(len(equations)), self.free).along(values)
 
     def _turned(self, equations: UnitingEquations) -> UnitingEquations:
-        """Kept rows, which turn with a rigid target."""
+        """Kept rows, rotated with a rigid target."""
         now, then = self.target.motion, self._kept_at
         if now is then:
             return equations
@@ -192,25 +191,25 @@ class Mortar(Contactors):
         return replace(rows, facing=facing)
 
     def told(self, facets: Ints) -> Array | None:
-        """What tells which facets of the target those of the contactor ``(m,)`` may touch ``(m, k)``; None where they may touch all."""
+        """Visibility keys of contactor facets ``(m,)``: ``(m, k)``; None if they may touch all target facets."""
         return None
 
     def _offsets(self, facets: Ints) -> Array | None:
-        """Offsets at the nodes of facets ``(m, nn)``; None for none (collective)."""
+        """Offsets at the nodes of facets ``(m, nn)``; None without offset (collective)."""
         if self.offset is None:
             return None
         dofs = self.surface.dofs[facets]
         return self.config.from_owners(self.nodes, self.offset[:, None], dofs.ravel()).reshape(dofs.shape)
 
     def _weighted_offset(self, rows: WeightedRows) -> Array:
-        """What the present offsets take from the gaps of rows, which may have been made with others ``(n,)`` (collective)."""
+        """Weighted means of the present offsets, for rows that may have been made with other offsets ``(n,)`` (collective)."""
         offsets = self._offsets(rows.facets)
         assert offsets is not None and self.offset is not None
         total, length = self._over_lengths(rows, offsets)
         return np.where(rows.covered, total / length, self.offset)
 
     def _over_lengths(self, rows: WeightedRows, values: Array) -> tuple[Array, Array]:
-        """Weighted ``values (m, nn)`` at the facets' nodes, and what plain rows were divided by ``(n,)`` each (collective)."""
+        """Weighted ``values (m, nn)`` at the facets' nodes, and divisors of plain rows ``(n,)`` each (collective)."""
         at = rows.points
         coefficients = at.duals.C @ self.basis.T
         weighted = np.einsum("mij,mj->mi", coefficients, values)
@@ -220,7 +219,7 @@ class Mortar(Contactors):
         return total[:, 0], np.where(rows.covered, np.linalg.norm(total[:, 1:], axis=1), 1.0)
 
     def with_variation(self, kinematics: MortarKinematics) -> MortarKinematics:
-        """The kinematics with rows that are derivatives of the gaps where these do not vanish on parallel facets, too (collective)."""
+        """The kinematics with rows that are exact derivatives of the gaps also on parallel facets (collective)."""
         rows = kinematics.rows
         if self.sliding != "finite":
             return kinematics
@@ -230,7 +229,7 @@ class Mortar(Contactors):
         return replace(kinematics, rows=replace(rows, equations=equations, length=length))
 
     def set_offset(self, offset: Array | None) -> None:
-        """Take other offsets ``(n,)``; contactors are to be placed again."""
+        """Set offsets ``(n,)``; contactors must be placed again."""
         super().set_offset(offset)
         self._united = None
 
@@ -242,7 +241,7 @@ class Mortar(Contactors):
         found = find_opposite(self.target, planes, x, reach, (keys, self.faced), self.told(facets))
         e = found.facet
         s = overlap(planes, (self.surface.shape, x), (shape, found.x), self.surface.sign[facets], e)
-        # what lies behind the facets in reach is no contact
+        # facets farther away than the reach have no contact
         weight = np.bincount(s.pair, s.weight, minlength=len(e))
         mean = np.bincount(s.pair, s.weight * s.gap, minlength=len(e)) / np.where(weight > 0, weight, 1.0)
         upon = (weight > 0) & (np.abs(mean) <= reach[e])
@@ -271,12 +270,12 @@ class Mortar(Contactors):
         return Pieces(s, np.arange(m), p.normal[i], none, nodes, y, p.hessians(i), np.zeros((0, 2), np.int64))
 
     def precedence(self, ratio: Array, dofs: Indices) -> Array:
-        """Order in which nodes of facets ``dofs (m, nn)`` take in what is hardly covered, alike on all ranks ``(m, nn)``.
+        """Order in which nodes of facets ``dofs (m, nn)`` receive hardly covered dual functions, equal on all ranks ``(m, nn)``.
 
-        A node's equation may take in nodes that come after it, so that no equation follows itself: middles come before vertices.
+        A node's equation may contain nodes later in the order, which excludes cycles; middles come before vertices.
 
         Args:
-            ratio: part of the node's share of all its facets that is covered ``(m, nn)``.
+            ratio: covered part of the node's share of all its facets ``(m, nn)``.
             dofs: local nodes of the facets ``(m, nn)``.
         """
         code = 1e-7 * self._code[dofs]
@@ -300,11 +299,11 @@ class Mortar(Contactors):
         is_covered = length > 0
         scale = np.where(is_covered, length, 1.0)
         direction = np.where(is_covered[:, None], direction / scale[:, None], nearest.normal)
-        # a row follows its own facets' other nodes where it takes them in, and the target's
+        # rows contain other nodes of their own facets if these have no function of their own, and nodes of the target
         other = ~np.eye(own.shape[1], dtype=bool)
         terms = [terms_of(own, own, -on_facet, other & (coefficients != 0)), terms_of(own[e], at.opposite, on_target)]
         row, term, value = self.elimination.at_owners(terms, scale)
-        # the rest keep their places on the target
+        # other contactors have node-to-surface rows
         alone = np.flatnonzero(~is_covered)
         k, a = np.nonzero(nearest.nodes[alone] >= 0)
         row, term = np.concatenate([row, alone[k]]), np.concatenate([term, nearest.nodes[alone][k, a]])
@@ -342,12 +341,12 @@ class Mortar(Contactors):
         )  # fmt: skip
 
     def begin_step(self) -> None:
-        """Facets that no longer face each other are forgotten."""
+        """Begin a step: pairs of facets that have faced each other are reset."""
         super().begin_step()
         if not self._afresh:
             self._united = None
 
     def let_go(self) -> None:
-        """Keep no feet and no segments."""
+        """Drop the kept closest points and segments."""
         super().let_go()
         self._kept = None

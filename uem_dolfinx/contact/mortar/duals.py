@@ -1,12 +1,12 @@
-"""Dual bases on the covered part of contactor facets, and the integrals that uniting equations are made of.
+"""Dual bases on the covered part of contactor facets, and the integrals of constraint equations.
 
-Per facet, with integrals over what target facets cover of it, ``D_k = int b_k`` and ``M_kl = int b_k b_l``, the dual functions
+Per facet, with integrals over its covered part, ``D_k = int b_k`` and ``M_kl = int b_k b_l``, the dual functions
 ``psi = D M^-1 b`` satisfy ``int psi_j b_k = delta_jk D_k`` and add up to one: the consistent basis of Cichosz and Bischoff (2011,
 doi:10.1016/j.cma.2010.11.004). The functions b are the shape functions on surfaces of degree 1. Those of degree 2 have no integral,
 or a negative one, at vertices; there b are Bernstein's, which are positive, and ``du = sum b_k (T du)_k``.
 
-Where little of a node's part of a facet is covered, its dual function would be large: it is added to that of another node of the
-facet, which keeps the sum.
+If little of a node's part of a facet is covered, its dual function would be large. It is added to the function of another node of
+the facet, which preserves the sum.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ STILL_COVERED = 0.01
 
 
 class Basis:
-    """What displacements of a facet are told by: its shape functions, or Bernstein's on facets of degree 2.
+    """Basis of the displacements of a facet: its shape functions, or Bernstein polynomials on facets of degree 2.
 
     Attributes:
         T: coefficients from nodal values ``(nn, nn)``.
-        mean: of the functions over the reference facet ``(nn,)``.
-        rank: 0 for vertices, 1 and 2 for the middles of edges and facets ``(nn,)``: coefficients take in nodes of lower rank alone.
+        mean: means of the functions over the reference facet ``(nn,)``.
+        rank: 0 for vertices, 1 and 2 for the middles of edges and facets ``(nn,)``: coefficients depend on nodes of lower rank only.
     """
 
     def __init__(self, shape: FacetShape):
@@ -47,7 +47,7 @@ class Basis:
         kinds = [0] * n_vertices + ([1] * n_edges + [2] * (len(shape.nodes) - n_vertices - n_edges) if shape.degree == 2 else [])
         self.rank: Ints = np.array(kinds, dtype=np.int64)
         self.T: Array = np.asarray(np.linalg.inv(self.at(shape.nodes)))
-        # they add up to one, and all have the same integral
+        # partition of unity with equal integrals
         self.mean: Array = np.full(len(self.rank), 1.0 / len(self.rank))
 
     @cached_property
@@ -75,7 +75,7 @@ def _barycentric(xi: Array) -> Array:
 
 @cache
 def basis_of(shape: FacetShape) -> Basis:
-    """The one basis of a shape of facets."""
+    """The basis of a facet shape, made once."""
     return Basis(shape)
 
 
@@ -85,9 +85,9 @@ class Covered:
 
     Attributes:
         facet: of each pair ``(k,)``, ascending.
-        D: of the functions ``(m, nn)``.
+        D: integrals of the functions ``(m, nn)``.
         M: of their products ``(m, nn, nn)``.
-        G: of their products with the gap, less the offset ``(m, nn)``.
+        G: of their products with the gap minus the offset ``(m, nn)``.
         N: of their products with the target's shape functions, pair by pair ``(k, nn, nt)``.
         own: of their products with each other and with the gap, pair by pair ``(k, nn, nn + 1)``.
         full: of the functions over the whole facets ``(m, nn)``.
@@ -111,7 +111,7 @@ class Covered:
             N: the target's shape functions there ``(q, nt)``.
             facet: contactor facet of each pair ``(k,)``.
             full: of the functions b over the whole facets ``(m, nn)``.
-            offset: of the gap at the points ``(q,)``; None for none.
+            offset: of the gap at the points ``(q,)``; None without offset.
         """
         s, k, (m, nn) = segments, len(facet), full.shape
         weighted = s.weight[:, None] * b
@@ -125,7 +125,7 @@ class Covered:
 
 
 def add_up(place: Ints, values: Array, n: int) -> Array:
-    """Sums of rows of ``values (q, c)`` whose ``place (q,)``, which ascends, is the same ``(n, c)``."""
+    """Sums of rows of ``values (q, c)`` with equal ``place (q,)``, which is ascending: ``(n, c)``."""
     out = np.zeros((n, values.shape[1]))
     if len(place):
         first = np.flatnonzero(np.diff(place, prepend=-1))
@@ -134,7 +134,7 @@ def add_up(place: Ints, values: Array, n: int) -> Array:
 
 
 def products(left: Array, right: Array) -> Array:
-    """Products of all columns of ``left (q, a)`` with all of ``right (q, b)``: ``(q, a b)``."""
+    """Products of all columns of ``left (q, a)`` with all columns of ``right (q, b)``: ``(q, a b)``."""
     return (left[:, :, None] * right[:, None, :]).reshape(len(left), left.shape[1] * right.shape[1])
 
 
@@ -145,10 +145,10 @@ class Duals:
     Attributes:
         A: combinations of the functions b ``(m, nn, nn)``.
         C: their integrals with the functions b ``(m, nn, nn)``.
-        kept: nodes of whose share enough is covered for a dual function of their own ``(m, nn)``.
-        own: nodes with one, the foremost not among them ``(m, nn)``.
-        foremost: node whose dual function makes their sum one ``(m,)``.
-        inverse: of the integrals of the functions' products; zero where no node has a function of its own ``(m, nn, nn)``.
+        kept: nodes whose share is sufficiently covered for a dual function of their own ``(m, nn)``.
+        own: nodes with such a function, except the foremost ``(m, nn)``.
+        foremost: node whose dual function completes the sum to one ``(m,)``.
+        inverse: of the integrals of the functions' products; zero on facets without functions of their own ``(m, nn, nn)``.
         gap: coefficients of the gap's projection onto the functions b ``(m, nn)``.
     """
 
@@ -161,15 +161,15 @@ class Duals:
     gap: Array
 
     def spread(self, facet: Ints, b: Array, multipliers: Array) -> tuple[Array, Array]:
-        """What a change of the covered part does to ``sum l_j int psi_j f``, at places of the facets: factors of f and of its projection.
+        """Derivative of ``sum l_j int psi_j f`` by the covered part at points of the facets: factors of f and of its projection.
 
         Args:
-            facet: of the places ``(q,)``.
+            facet: facets of the points ``(q,)``.
             b: functions there ``(q, nn)``.
             multipliers: l, of the facets' nodes ``(m, nn, c)``.
 
         Returns:
-            Of f there ``(q, c)``, and of the coefficients of its projection onto the functions b ``(q, nn, c)``.
+            Factors of f there ``(q, c)``, and of the coefficients of its projection onto the functions b ``(q, nn, c)``.
         """
         fore = multipliers[np.arange(len(multipliers)), self.foremost]
         more = np.where(self.own[:, :, None], multipliers - fore[:, None], 0.0)
@@ -177,17 +177,17 @@ class Duals:
         return fore[facet] + here, b[:, :, None] * (more[facet] - here[:, None])
 
     def at_end(self, facet: Ints, b: Array, gap: Array) -> Array:
-        """How weighted gaps grow with what is covered, at places of the covered part's boundary.
+        """Derivative of weighted gaps by the covered part, at points of its boundary.
 
         The derivative of ``psi`` counts too: ``d int psi_j g = (b_j G_j + psi_j (g - sum_k b_k G_k)) ds`` with the gap's projection G.
 
         Args:
-            facet: of the places ``(q,)``.
+            facet: facets of the points ``(q,)``.
             b: functions there ``(q, nn)``.
-            gap: there ``(q,)``.
+            gap: gap there ``(q,)``.
 
         Returns:
-            For the nodes of each facet ``(q, nn)``.
+            Derivatives for the nodes of each facet ``(q, nn)``.
         """
         mean = self.gap[facet]
         psi = np.einsum("qjb,qb->qj", self.A[facet], b)
@@ -202,19 +202,19 @@ def dual_functions(covered: Covered, precedence: Array, before: Bools) -> Duals:
 
     Args:
         covered: integrals over the facets.
-        precedence: of the facets' nodes ``(m, nn)``; what is hardly covered goes to the foremost node of the facet.
+        precedence: of the facets' nodes ``(m, nn)``; hardly covered functions are added to the foremost node of the facet.
         before: nodes that had a dual function of their own before ``(m, nn)``.
     """
     m, nn = covered.D.shape
     kept: Bools = np.where(before, STILL_COVERED, HARDLY_COVERED) * covered.full <= covered.D
     row, foremost = np.arange(m), np.argmax(precedence, axis=1)
-    # no dual function can be told from another on a facet whose foremost node is hardly covered with all others
+    # if all nodes including the foremost are hardly covered, no dual function can be distinguished
     own = kept & (np.arange(nn) != foremost[:, None])
     A, inverse = np.zeros((2, m, nn, nn))
     some = np.flatnonzero(own.any(axis=1))
     if len(some):
         size = covered.D[some].sum(axis=1)
-        # functions that are not kept take no part in the inverse but through their sum
+        # dropped functions enter only through the sum
         inverse[some] = np.linalg.pinv(covered.M[some] / size[:, None, None], hermitian=True) / size[:, None, None]
         A[some] = covered.D[some][:, :, None] * inverse[some] * own[some][:, :, None]
     A[row, foremost] = 1.0 - A.sum(axis=1)

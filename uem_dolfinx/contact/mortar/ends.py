@@ -1,15 +1,15 @@
-"""Second derivatives of weighted gaps where the target ends over contactor facets: what is covered changes, and dual functions with it.
+"""Second derivatives of weighted gaps at target ends over contactor facets, where covered part and dual functions vary.
 
 With multipliers l, and f the foremost node, the weighted gaps of a facet sum up to
 
     int (l_f + w . b) g    with    w = M^-1 (m D),    m_j = l_j - l_f for nodes with functions of their own, zero for others,
 
-and grow with what is covered by the integral over its boundary of ``h v``, where v is how fast that moves outward and
+and vary with the covered part by the integral of ``h v`` over its boundary, where v is its outward velocity and
 
     h = l_f g + sum_j m_j b_j c_j + w . b (g - b . c)    with    c = M^-1 int b g.
 
-The place of the target's boundary on the contactor facet, the height of the gap there, c and w change with the displacement; the
-derivatives of ``int h v`` with these, and what ends change in the derivatives inside, are symmetric together.
+The position of the target's boundary on the contactor facet, the gap there, c and w depend on the displacement. The derivatives of
+``int h v`` by these, together with the effect of ends on the derivatives inside, are symmetric.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ AT_ONCE = 1000
 
 
 def curvature(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
-    """Minus the second derivatives of weighted gaps times their multipliers, those of the target's ends among them.
+    """Minus the second derivatives of weighted gaps times their multipliers, including the target's ends.
 
     Args:
         at: points of the segments.
@@ -55,13 +55,13 @@ def curvature(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
 
 @dataclass(frozen=True)
 class _Ends:
-    """Ends of the target over contactor facets that press.
+    """Ends of the target over contactor facets with pressure.
 
     Attributes:
         at: points of the segments.
         other: shape of the target's facets.
         pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
-        which: pairs, with all that are opposite of a facet ``(p,)``.
+        which: pairs, with all opposite facets of each contactor facet ``(p,)``.
     """
 
     at: SegmentPoints
@@ -70,7 +70,7 @@ class _Ends:
     which: Ints
 
     def second_derivatives(self) -> list[tuple[Ints, Array]]:
-        """Global nodes and symmetric blocks: of each pair, and of each with all that are opposite of the same facet."""
+        """Global nodes and symmetric blocks: of each pair, and of each pair with all opposite facets of the same contactor facet."""
         at, which = self.at, self.which
         sides = at.sides(self.other, which).at_ends()
         half = self._local(sides)
@@ -81,7 +81,7 @@ class _Ends:
         return [(nodes, half + half.transpose(0, 2, 1)), self._in_the_mean(sides)]
 
     def _factors(self, e: Ints, s: Sides) -> tuple[Array, Array, Array, Array]:
-        """Of places on facets ``e (q,)``: ``l_f + w . b``, h ``(q,)``, how h changes with b ``(q, nc)``, and ``g - b . c`` ``(q,)``."""
+        """At points on facets ``e (q,)``: ``l_f + w . b``, h ``(q,)``, dh/db ``(q, nc)``, and ``g - b . c`` ``(q,)``."""
         duals = self.at.duals
         fore, more, w, c = (values[e] for values in self._of_facets())
         wb, left = np.einsum("qb,qb->q", w, s.b), s.gap - s.offset - np.einsum("qb,qb->q", s.b, duals.gap[e])
@@ -96,14 +96,14 @@ class _Ends:
         return fore, more, np.einsum("mij,mj->mi", duals.inverse, more * self.at.covered.D), duals.gap
 
     def _local(self, s: Sides) -> Array:
-        """Half of what is of one pair ``(p, (nc + nt) gdim, (nc + nt) gdim)``."""
+        """Half of the terms within one pair ``(p, (nc + nt) gdim, (nc + nt) gdim)``."""
         at, k = self.at, len(self.which)
         e = at.facet[self.which[s.pair]]
         n, size = at.planes.normal[e], at.planes.size[e]
         press, h, with_b, _ = self._factors(e, s)
         v, grown = -s.way, s.motions.of_area(n / size[:, None])
         rise = s.motions.along(s.t - n) + 2 * s.gap[:, None, None] * grown
-        # places on the contactor facet, and how the functions change there
+        # points on the contactor facet, and derivatives of the functions there
         tab = at.shape.tabulate(s.xi)
         over = dual_tangents(tangents(tab, at.x[e]), n)
         if at.offsets is not None:
@@ -113,7 +113,7 @@ class _Ends:
         half += sum_of_products(s.pair, s.weight * h, grown, v, k)
         of_b = np.einsum("qb,qbf->qf", with_b, np.einsum("qaf,ab->qbf", tab.dN, np.linalg.inv(basis_of(at.shape).T)))
         if at.radius is not None:
-            # circles grow as the place goes outward, and with the nodes
+            # circumferences grow with the point's outward motion, and with the nodes
             r, wider = np.einsum("qa,qa->q", s.motions.phi, at.x[e][:, :, 0]), np.zeros(v.shape)
             of_b += (h / r)[:, None] * np.einsum("qaf,qa->qf", tab.dN, at.x[e][:, :, 0])
             wider[:, : s.motions.nc, 0] = s.motions.phi / r[:, None]
@@ -129,7 +129,7 @@ class _Ends:
         half += sum_of_products(s.pair, weight, sinks, s.motions.of_area(s.outward), k)
         if at.shape.dim == 1:
             return half
-        # sides turn, and area vectors are bilinear
+        # rotation of sides; area vectors are bilinear
         along = np.einsum("qfg,qg->qf", over, s.ahead)
         step = Motions(
             np.einsum("qaf,qf->qa", tab.dN, along), s.shift, np.einsum("qg,qg->q", s.t, s.ahead) / size, s.motions.turning
@@ -144,13 +144,13 @@ class _Ends:
         return half
 
     def _at_cuts(self, s: Sides) -> Array:
-        """Half of what comes from places where sides leave the contactor facet, which move along its own sides."""
+        """Half of the terms of points at which sides leave the contactor facet, which move along its sides."""
         e = self.at.facet[self.which[s.pair]]
         _, h, _, _ = self._factors(e, s)
         return sum_of_products(s.pair, 0.5 * s.weight * h, -s.way, -s.motions.along(s.cut), len(self.which))
 
     def _in_the_mean(self, s: Sides) -> tuple[Ints, Array]:
-        """What goes through c and w, with which all that is opposite of a facet has to do."""
+        """Terms through c and w, which couple all opposite facets of a contactor facet."""
         at, which, k = self.at, self.which, len(self.which)
         nc, nt, g = at.nodes.shape[1], at.opposite.shape[1], at.x.shape[2]
         width = (nc + nt) * g
@@ -161,7 +161,7 @@ class _Ends:
         v = (-s.way * s.weight[:, None, None]).reshape(len(e), 1, width)
         z = add_up(s.pair, (((more[e] - wb[:, None]) * s.b)[:, :, None] * v).reshape(len(e), nc * width), k)
         y = add_up(s.pair, ((s.b * left[:, None])[:, :, None] * v).reshape(len(e), nc * width), k)
-        # what the gap's projection changes by inside
+        # derivative of the gap's projection inside
         place = np.full(len(at.facet), -1, dtype=np.int64)
         place[which] = np.arange(k)
         q = np.flatnonzero(place[at.segments.pair] >= 0)

@@ -1,4 +1,4 @@
-"""Rows of weighted gaps as lists of terms, at the owners of their nodes."""
+"""Rows of weighted gaps as lists of terms, on the ranks that own their nodes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from uem_dolfinx.parallel import Exchange
 MOST_BITS = 52
 
 
-#: Rows that terms belong to, the nodes they follow and the coefficients.
+#: Row, followed node and coefficient of each term.
 Terms: TypeAlias = tuple[Ints, Ints, Array]
 
 
 class Pieces(NamedTuple):
-    """Segments of pairs of facets, with their contactor facets and what is opposite; fields as those of ``SegmentPoints``.
+    """Segments of pairs of facets, with contactor and opposite facets; fields as in ``SegmentPoints``.
 
     ``facing`` is as in ``WeightedRows``.
     """
@@ -43,29 +43,29 @@ class Pieces(NamedTuple):
 
 @dataclass(frozen=True)
 class WeightedRows:
-    """Equations of all contactors, one each.
+    """Equations of all contactors, one per contactor.
 
     Attributes:
-        equations: in the order of the contactors; none is active. Their left sides are the derivatives of the gaps.
-        length: what these were divided by ``(n,)``.
-        plain: the same, along the normals of the contactor's facets alone.
-        points: quadrature points of the segments, where the rows were made.
+        equations: in the order of the contactors, all inactive. Their left sides are the derivatives of the gaps.
+        length: divisors of these equations ``(n,)``.
+        plain: the same equations with only the derivatives along the normals of the contactor's facets.
+        points: quadrature points of the segments at the time when the rows were made.
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
-        ratio: part of the contactor's share of its facets that is covered ``(n,)``.
-        area: integral of the contactor's dual function, what its multiplier is a pressure on ``(n,)``.
-        stretch: areas of the facets around the contactor over their reference areas ``(n,)``.
-        share: of the multiplier in the contact force that belongs to this area ``(n,)``; 1 but for the middles of quadratic facets.
-        weights: by what contactors follow other nodes in the same mean, whatever the direction, for friction; None without.
-        normal: directions of the gaps' derivatives with the contactors' own displacements, across which friction acts ``(n, gdim)``;
-            None without.
-        slope: lengths of these derivatives, over those of the plain rows ``(n,)``; None without friction.
-        push: sum of the lengths of what each facet has of these derivatives, over those of the plain rows ``(n,)``: what the facets push
-            with together, each along its own normal; None without friction.
-        parts: of the facets' nodes, what the facet has of their own derivatives ``(m, nc, gdim)``.
-        whole: integral of the contactor's dual function times its own shape function, that these weights are parts of ``(n,)``; None
+        ratio: covered part of the contactor's share of its facets ``(n,)``.
+        area: integral of the contactor's dual function, the area of its multiplier as a pressure ``(n,)``.
+        stretch: current over reference area of the facets around the contactor ``(n,)``.
+        share: contact force of this area over the multiplier ``(n,)``; 1 except at the middle nodes of quadratic facets.
+        weights: terms by which contactors follow other nodes in the same mean, for friction; None without friction.
+        normal: directions of the gaps' derivatives by the contactors' own displacements, normal to friction ``(n, gdim)``; None
             without friction.
-        facing: contactor and target facets that lie upon each other, by what tells them in any partition ``(p, 2)``.
+        slope: lengths of these derivatives over the lengths for the plain rows ``(n,)``; None without friction.
+        push: sum of the lengths of each facet's part of these derivatives, over the lengths for the plain rows ``(n,)``: the sum of
+            the facets' forces along their own normals; None without friction.
+        parts: each facet's part of the nodes' own derivatives ``(m, nc, gdim)``.
+        whole: integral of the contactor's dual function times its own shape function, the divisor of ``weights`` ``(n,)``; None
+            without friction.
+        facing: keys, independent of the partition, of contactor and target facets that cover each other ``(p, 2)``.
     """
 
     equations: UnitingEquations
@@ -88,7 +88,7 @@ class WeightedRows:
 
 
 class Elimination:
-    """Rows of the contactors of one surface, which live at the owners of their nodes.
+    """Assembly of the rows of one surface on the ranks that own the nodes.
 
     Args:
         config: configuration of the displacement.
@@ -102,20 +102,20 @@ class Elimination:
         self._own = config.to_global(nodes)
 
     def at_owners(self, parts: Sequence[Terms], scale: Array) -> Terms:
-        """Terms of rows, each a node, the node that it follows and the coefficients, at their owners, over ``scale (n,)`` (collective)."""
+        """Send terms (node, followed node, coefficients) to the owners of their nodes and divide by ``scale (n,)`` (collective)."""
         node, term, value = (np.concatenate(part) for part in zip(*parts))
         node, term, value = Exchange.to(self.config.comm, self.config.owner_of(node)).send(node, term, value)
         row = self._place[node - self.config.first]
         return add_up_terms((row, term, value / scale[row, None]))
 
     def variation(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:
-        """What the derivatives of the gaps add to the ``plain`` rows, since normals and weights vary, over ``scale (n,)`` (collective).
+        """Terms of the gaps' derivatives by the variation of normals and weights, over ``scale (n,)`` (collective).
 
-        Nothing for contactors whose gap does not open along their own direction, since the end of what covers them moves faster than
-        they do: all others can be eliminated for any active set.
+        They are dropped for contactors whose own coefficient would become negative, because the end of the target moves faster than
+        the contactor. All other contactors can be eliminated for any active set.
 
         Returns:
-            Terms, and what each facet has of its nodes' own derivatives ``(m, nc, gdim)``.
+            Terms, and each facet's part of its nodes' own derivatives ``(m, nc, gdim)``.
         """
         on_facet, on_target = at.gap_derivatives()
         terms = [terms_of(at.nodes, at.nodes, -on_facet), terms_of(at.nodes[at.facet], at.opposite, -on_target)]
@@ -125,7 +125,7 @@ class Elimination:
         return (row[kept], term[kept], value[kept]), np.einsum("mjjg->mjg", on_facet)
 
     def of_themselves(self, plain: UnitingEquations, variation: Terms) -> Array:
-        """Directions of rows with what their terms have of their own contactors ``(n, gdim)``."""
+        """Directions of rows including the terms at their own contactors ``(n, gdim)``."""
         row, term, value = variation
         itself, direction = term == self._own[row], plain.direction.copy()
         # each row has at most one such term
@@ -133,9 +133,9 @@ class Elimination:
         return direction
 
     def derivatives(self, plain: UnitingEquations, variation: Terms) -> tuple[UnitingEquations, Array]:
-        """Equations whose left sides are the derivatives of the gaps, and what each was divided by ``(n,)``.
+        """Equations whose left sides are the derivatives of the gaps, and their divisors ``(n,)``.
 
-        They follow other contactors, and these them, by parts of second order in the angles between facets.
+        Contactors follow each other with coefficients of second order in the angles between facets.
         """
         row, term, value = variation
         other, direction = term != self._own[row], self.of_themselves(plain, variation)
@@ -146,7 +146,7 @@ class Elimination:
 
 
 class Remembered:
-    """Bits of contactors that tell some of their shares of the facets around them from others, alike in any partition (collective).
+    """Bits of contactors, one for each facet around them, independent of the partition (collective).
 
     Args:
         config: configuration of the displacement.
@@ -164,17 +164,17 @@ class Remembered:
         number[order] = np.arange(len(node)) - np.searchsorted(node[order], node[order])
         place = np.empty(self.dofs.size, dtype=np.int64)
         (place[meeting.rows],) = meeting.back(number)
-        #: Bits of the facets at each of their nodes; numbers of type float hold no more.
+        #: Bit number of each facet at each of its nodes, limited by the digits of a float.
         self._place = place.reshape(self.dofs.shape)
         self._has = self._place < MOST_BITS
 
     def of(self, which: Bools) -> Ints:
-        """Bits ``(n,)`` of nodes of facets ``which (m, nn)``, or all of a facet's ``(m, 1)`` (collective)."""
+        """Bits ``(n,)`` for nodes of facets ``which (m, nn)``, or for all nodes of facets ``(m, 1)`` (collective)."""
         bits = np.ldexp((self._has & which).astype(float), np.minimum(self._place, MOST_BITS))
         return self.config.to_owners(self.dofs.ravel(), bits.ravel())[self.nodes].astype(np.int64)
 
     def shares(self, bits: Ints) -> Bools:
-        """The nodes of facets ``(m, nn)`` of which ``of`` returned these (collective)."""
+        """Inverse of ``of``: the nodes of facets ``(m, nn)`` with these bits (collective)."""
         there = self.config.from_owners(self.nodes, bits[:, None].astype(float), self.dofs.ravel()).astype(np.int64)
         return np.asarray(self._has & (there.reshape(self.dofs.shape) >> np.minimum(self._place, MOST_BITS) & 1 > 0))
 
@@ -186,7 +186,7 @@ def terms_of(rows: Ints, followed: Ints, values: Array, which: Bools | bool = Tr
 
 
 def add_up_terms(*parts: Terms) -> Terms:
-    """Terms of several lists, those of the same row and node added up."""
+    """Terms of several lists; terms of the same row and node are added up."""
     row, term, value = (np.concatenate(part) for part in zip(*parts))
     if not len(row):
         return row, term, value

@@ -1,17 +1,17 @@
-"""Rows of tied contactors: each keeps its place relative to the part of the target below it, in all components and for good.
+"""Rows of tied contactors, which keep their position relative to the target below, permanently and in all components.
 
-With the target's shape functions N_a at the foot of a contactor, its height h over the target and the unit normal n there, all as they
-were when it was tied,
+With the target's shape functions N_a at the closest point of a contactor, its height h and the unit normal n there, at the time of
+tying,
 
     x_i - sum_a N_a x_a - h n(x_a) = 0.
 
-A contactor that touches follows by constant weights; a gap keeps its width and turns with the target. With mortar this holds in means
-over the facets, weighted with dual functions psi_i of integrals C_ij with the contactor's shape functions:
+Without a gap, weights are constant; a gap keeps its width and rotates with the target. With mortar this holds in means over the
+facets, weighted with dual functions psi_i, whose integrals with the contactor's shape functions are C_ij:
 
     sum_j C_ij x_j - int psi_i (sum_a N_a x_a + h n) = 0.
 
-Where Dirichlet conditions hold a component of a contactor and of what it follows, as on a plane of symmetry, its dual function is
-added to that of a neighbour, for this component.
+If Dirichlet conditions prescribe a component of a contactor and of the nodes that it follows, as on a plane of symmetry, its dual
+function is added to the function of a neighbour, for this component.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class Spacers:
-    """Places of contactors at a height over the target, between which the gap turns with it.
+    """Positions of contactors with a gap, which rotates with the target.
 
     Attributes:
-        contactor: global nodes that a place counts for ``(p, k)``.
-        weight: by how much, in each component ``(p, k, gdim)``.
+        contactor: global nodes with a part in each position ``(p, k)``.
+        weight: their weights in each component ``(p, k, gdim)``.
         followed: global nodes of the facet below ``(p, nt)``.
-        dN: derivatives of their shape functions at the foot ``(p, nt, fdim)``.
-        height: over the foot along the facet's normal ``(p,)``.
-        y: where the facet's nodes were ``(p, nt, gdim)``.
+        dN: derivatives of their shape functions at the closest point ``(p, nt, fdim)``.
+        height: height along the facet's normal ``(p,)``.
+        y: positions of the facet's nodes at the time of tying ``(p, nt, gdim)``.
     """
 
     contactor: Ints
@@ -60,13 +60,13 @@ class Spacers:
     y: Array
 
     def take(self, which: Bools) -> Spacers:
-        """Some of them."""
+        """A subset of the spacers."""
         return replace(self, **{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
     def turning(self, y: Array) -> tuple[Array, Array, Array, Array]:
         """Area vectors with the facet's nodes at ``y (p, nt, gdim)``: lengths, unit normals, their projectors, and derivatives.
 
-        The last are those of the area vectors with the nodes ``(p, nt, gdim, gdim)``.
+        The derivatives are those of the area vectors by the nodes ``(p, nt, gdim, gdim)``.
         """
         t, g = np.einsum("paf,pag->pfg", self.dN, y), y.shape[2]
         if g == 2:
@@ -82,7 +82,7 @@ class Spacers:
     def at(self, y: Array, kept: bool) -> tuple[Array, Array]:
         """Offsets ``h n (p, gdim)`` with the facets' nodes at ``y``, and their derivatives ``(p, nt, gdim, gdim)``.
 
-        If ``kept`` they are linear, about where the nodes were.
+        If ``kept``, they are linearised at the time of tying.
         """
         length, n, across, slopes = self.turning(self.y if kept else y)
         slopes = (self.height / length)[:, None, None, None] * (across[:, None] @ slopes)
@@ -112,13 +112,13 @@ class TiedRows:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         has: components in which contactors have an equation ``(n, gdim)``.
-        own: what these were divided by ``(n, gdim)``.
-        share: forces of the tractions, whose means multipliers are, over these ``(n, gdim)``; ones where multipliers are nodal forces.
-        area: of the reference surface that such forces are integrals over ``(n,)``; None where they are nodal.
+        own: divisors of these equations ``(n, gdim)``.
+        share: forces over multipliers ``(n, gdim)``; with mortar multipliers are mean tractions, otherwise nodal forces and share is 1.
+        area: reference areas for these forces ``(n,)``; None for nodal forces.
         terms: contactors, global nodes and weights by which they follow ``(k,)``, ``(k,)``, ``(k, gdim)``.
-        spacers: over which gaps are kept; None where no rank has any.
-        held: places on a rigid target, where it was drawn ``(n, gdim)``; None on a mesh.
-        kept: whether normals stay, as with small and fixed sliding.
+        spacers: positions with kept gaps; None if no rank has a gap.
+        held: tied positions on a rigid target in its reference position ``(n, gdim)``; None on a mesh.
+        kept: whether normals are constant, as with small and fixed sliding.
     """
 
     config: Configuration
@@ -147,12 +147,12 @@ class TiedRows:
         return None if self.spacers is None else Halo(self.config, self.spacers.followed.ravel())
 
     def _y(self) -> Array:
-        """Where the nodes of the facets below spacers are ``(p, nt, gdim)`` (collective)."""
+        """Current positions of the facet nodes below spacers ``(p, nt, gdim)`` (collective)."""
         assert self._below is not None and self.spacers is not None
         return self._below.take(self.config.x.__getitem__).reshape(self.spacers.y.shape)
 
     def equations(self, motion: Motion | None) -> UnitingEquations:
-        """All equations where the bodies and a rigid target are now, contactor by contactor (collective)."""
+        """All equations in the current configuration, sorted by contactor (collective)."""
         config, n, g = self.config, len(self.nodes), self.config.gdim
         row, followed, weight = self.terms
         apart = config.x[self.nodes]
@@ -161,7 +161,7 @@ class TiedRows:
         else:
             apart = apart - sums_of_rows(row, weight * self._halo.take(config.x.__getitem__), n)
         at, c = np.nonzero(weight)
-        # contactors and components, what they follow, and by what vectors
+        # contactors, components, followed nodes and coefficient vectors
         parts = [(row[at], c, followed[at], weight[at, c, None] * np.eye(g)[c])]
         if self.spacers is not None:
             offset, slopes = self.spacers.at(self._y(), self.kept)
@@ -188,7 +188,7 @@ class TiedRows:
         return nodes, equations.forces(multipliers[self.has])
 
     def curvature(self, multipliers: Array) -> list[tuple[Ints, Array]]:
-        """Blocks of minus the derivatives of the rows times ``multipliers (n, gdim)``, as of ``Kinematics`` (collective)."""
+        """Blocks of minus the derivatives of the rows times ``multipliers (n, gdim)``, as in ``Kinematics`` (collective)."""
         s = self.spacers
         if s is None or self.kept:
             return []
@@ -200,7 +200,7 @@ class TiedRows:
 
 
 def to_surface(config: Configuration, nodes: Indices, target: Target, which: Bools) -> TiedRows:
-    """Rows of the contactors ``which (n,)`` on a rigid target where both are now."""
+    """Rows of the contactors ``which (n,)`` on a rigid target at the current positions."""
     n, g = len(nodes), config.gdim
     points = config.x[nodes]
     held = points if target.motion is None else target.motion.back(points)
@@ -213,7 +213,7 @@ def to_surface(config: Configuration, nodes: Indices, target: Target, which: Boo
 def to_facets(
     config: Configuration, nodes: Indices, target: MeshTarget, p: FacetProjection, which: Bools, kept: bool
 ) -> TiedRows:
-    """Rows of the contactors ``which (n,)``, each at the foot of its projection p (collective)."""
+    """Rows of the contactors ``which (n,)``, each at the closest point of its projection p (collective)."""
     n, g, i = len(nodes), config.gdim, np.flatnonzero(which)
     points = config.x[nodes[i]]
     tab, height = _foot(target, p.x[i], p.xi[i], points)
@@ -226,13 +226,13 @@ def to_facets(
 
 
 def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: bool) -> TiedRows:
-    """Rows of the contactors ``which (n,)`` in means over the segments that were found for contact (collective).
+    """Rows of the contactors ``which (n,)`` as means over the segments of contact (collective).
 
     Args:
         discretisation: of the contactors.
-        rows: of contact, where they are now.
-        which: contactors to be tied, if anything covers them.
-        kept: as of ``TiedRows``.
+        rows: rows of contact in the current configuration.
+        which: contactors to be tied, if they are covered.
+        kept: see ``TiedRows``.
     """
     d, at, config, g = discretisation, rows.points, discretisation.config, discretisation.config.gdim
     assert isinstance(d.target, MeshTarget)
@@ -270,8 +270,8 @@ def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: boo
 def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
     """Dual functions for each component (collective).
 
-    Those of nodes that a condition holds together with what they follow, as on a plane of symmetry, are added to others', unless all of a
-    facet are: their equations would hold what lies beside the plane.
+    If a node and the nodes that it follows are prescribed, as on a plane of symmetry, its function is added to the functions of
+    other nodes, since its equation would constrain nodes next to the plane. Facets with all nodes prescribed are excepted.
 
     Args:
         d: of the contactors.
@@ -293,7 +293,7 @@ def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
     held &= ~held.all(axis=1, keepdims=True)
     found = []
     for c in range(g):
-        # with no part of it ever enough, and behind all others
+        # never sufficiently covered, and last in precedence
         without = replace(covered, full=np.where(held[..., c], np.inf, covered.full))
         found.append(dual_functions(without, np.where(held[..., c], -1.0, first), none))
     return found
@@ -307,6 +307,6 @@ def _foot(target: MeshTarget, y: Array, xi: Array, points: Array) -> tuple[Tabul
 
 
 def _standing(config: Configuration, spacers: Spacers) -> Spacers | None:
-    """Those that are higher than rounding; None if no rank has any (collective)."""
+    """Spacers whose height exceeds rounding; None if no rank has any (collective)."""
     high = np.abs(spacers.height) > GAP_ROUNDING * config.size
     return spacers.take(high) if reduced(config.comm, bool(high.any()), op=MPI.LOR) else None
