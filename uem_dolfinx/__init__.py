@@ -141,7 +141,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.solve.steps.step import Step
     from uem_dolfinx.solve.steps.time_steps import TimeStep, time_steps
 
-#: Modules that are imported when one of their names is asked for.
+#: Modules that are imported on first use of one of their names.
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",

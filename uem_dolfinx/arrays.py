@@ -1,4 +1,4 @@
-"""Types of NumPy arrays, for annotations, and what NumPy is slow at on small arrays."""
+"""Types of NumPy arrays for annotations, and fast replacements of NumPy functions for small arrays."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ Array: TypeAlias = npt.NDArray[np.float64]
 Ints: TypeAlias = npt.NDArray[np.int64]
 Bools: TypeAlias = npt.NDArray[np.bool_]
 AnyArray: TypeAlias = npt.NDArray[Any]
-#: Local nodes, facets or cells, as DOLFINx numbers them.
+#: Local numbers of nodes, facets or cells in DOLFINx.
 Indices: TypeAlias = npt.NDArray[np.int32]
 
 
 def sums_of_rows(places: Ints, values: Array, size: int) -> Array:
-    """Sums of the rows of ``values (m, k)`` that have the same place, among so many ``(size, k)``; as ``numpy.add.at``, but quick."""
+    """Sums of the rows of ``values (m, k)`` with the same index in ``places (m,)``: ``(size, k)``; a faster ``numpy.add.at``."""
     k = values.shape[1]
-    # of no rows they would be integers
+    # cast, since sums of no rows would be integers
     return np.asarray(np.bincount((places[:, None] * k + np.arange(k)).ravel(), values.ravel(), size * k), float).reshape(size, k)
 
 
 def sums_of_groups(values: Array, first: Ints, order: Ints | None = None) -> Array:
-    """Sums of consecutive rows of ``values (m, ...)``, each group from ``first (k,)`` on, taken in an ``order (m,)`` if told ``(k, ...)``.
+    """Sums of groups of rows of ``values (m, ...)`` that start at ``first (k,)``, optionally in an ``order (m,)``: ``(k, ...)``.
 
-    As ``numpy.add.reduceat`` along the first axis, but quick; SciPy's matrices add one row after the other.
+    A faster ``numpy.add.reduceat`` along the first axis; SciPy's matrices add one row after the other.
     """
     from scipy.sparse import csr_matrix
 
@@ -36,6 +36,6 @@ def sums_of_groups(values: Array, first: Ints, order: Ints | None = None) -> Arr
 
 
 def cross_products(a: Array, b: Array) -> Array:
-    """Cross products of vectors in space, ``a`` and ``b (..., 3)``; as ``numpy.cross``, but quick."""
+    """Cross products of 3D vectors ``a`` and ``b (..., 3)``; a faster ``numpy.cross``."""
     ahead, back = [1, 2, 0], [2, 0, 1]
     return np.asarray(a[..., ahead] * b[..., back] - a[..., back] * b[..., ahead])

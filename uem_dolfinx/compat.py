@@ -62,7 +62,7 @@ def create_mesh(comm: MPI.Comm, cells: npt.NDArray[np.int64], x: npt.NDArray[np.
 
 
 def vtk_nodes(cell: str, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Nodes of cells ``(n, n_nodes)`` from DOLFINx's order into that of VTK and XDMF."""
+    """Nodes of cells ``(n, n_nodes)``, reordered from DOLFINx to VTK and XDMF."""
     out = np.empty_like(nodes)
     out[:, cpp.io.perm_vtk(getattr(mesh.CellType, cell), nodes.shape[1])] = nodes
     return out
@@ -101,7 +101,7 @@ def belongs_to(meshtags: Any, domain: Any) -> bool:
 
 
 def communicator_of(meshtags: Any) -> MPI.Comm | None:
-    """Communicator of the mesh of MeshTags, None if they do not tell it."""
+    """Communicator of the mesh of MeshTags, None if unknown."""
     return getattr(meshtags.mesh if hasattr(meshtags, "mesh") else meshtags.topology, "comm", None)
 
 
@@ -255,7 +255,7 @@ def petsc_vector(u: Any) -> PETSc.Vec:
 
 @contextmanager
 def named_for_code(*expressions: Any) -> Iterator[None]:
-    """Within this block the Functions of UFL expressions and forms have names that can stand in code, into which FFCx 0.5 writes them."""
+    """Within this block Functions in UFL expressions and forms have names that are valid in code, into which FFCx 0.5 writes them."""
     functions = {f for e in expressions for f in ufl.algorithms.extract_coefficients(e) if isinstance(f, fem.Function)}
     names = {f: f.name for f in functions if re.search(r"\W", f.name)}
     for f, name in names.items():
@@ -299,7 +299,7 @@ def _all_cells(domain: Any) -> npt.NDArray[np.int32]:
 
 
 def petsc_option_used(name: str) -> bool | None:
-    """Whether PETSc has asked for an option of its database; None where that cannot be told, as petsc4py does not pass it on."""
+    """Whether PETSc has used an option of its database; None if unknown, since petsc4py has no such function."""
     used = ctypes.c_int(0)
     try:
         ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
@@ -365,7 +365,7 @@ def is_condition_of(bc: Any, V: Any) -> bool:
 
 
 def is_on(V: Any, domain: Any) -> bool:
-    """Whether a space, perhaps as DOLFINx's C++ layer knows it, lives on a mesh."""
+    """Whether a space, possibly of DOLFINx's C++ layer, is on a mesh."""
     topologies = [getattr(m.topology, "_cpp_object", m.topology) for m in (V.mesh, domain)]
     return topologies[0] is topologies[1]
 
@@ -436,7 +436,7 @@ def gmsh_is_initialized(gmsh: Any) -> bool:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Send what C code writes to the terminal to nowhere."""
+    """Discard output of C code to the terminal."""
     null = os.open(os.devnull, os.O_WRONLY)
     saved = [(fd, os.dup(fd)) for fd in (1, 2)]
     try:

@@ -113,7 +113,7 @@ def stiffen(A: PETSc.Mat, K: PETSc.Mat, idle: Bools) -> None:
 
 
 def is_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
-    """Whether A, which acts on ``space``, is symmetric but for rounding (collective)."""
+    """Whether A, which acts on ``space``, is symmetric up to rounding (collective)."""
     return bool(reduced(A.comm.tompi4py(), rows_are_symmetric(A, space), op=MPI.LAND))
 
 

@@ -69,7 +69,7 @@ def singles(config: Configuration, rows: GivenRows, size: Array, spared: Bools) 
     Args:
         config: configuration of the displacement.
         rows: of this rank.
-        size: as of ``sizes``; a row without any takes no part.
+        size: as returned by ``sizes``; rows of zeros are ignored.
         spared: terms of nodes that are eliminated only where nothing else can be ``(k,)``.
     """
     g, counted = config.block, (size > 0).astype(float)
@@ -110,8 +110,8 @@ def eliminated(config: Configuration, rows: GivenRows, item: Ints, size: Array, 
         config: configuration of the displacement.
         rows: of this rank.
         item: number of the declaration of each ``(m,)``.
-        size: as of ``sizes``.
-        spared: as of ``singles``.
+        size: as returned by ``sizes``.
+        spared: as in ``singles``.
 
     Returns:
         The independent rows whose nodes this rank owns, and which of the given ones follow from those before them ``(m,)``.

@@ -1,4 +1,4 @@
-"""Nodes that users name by tags or by coordinates, on whichever rank they are."""
+"""Nodes given by tags or by coordinates, on any rank."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ def is_point(where: Any) -> bool:
 
 
 def nodes_at(config: Configuration, where: Any, role: str, dims: Sequence[int] | None = None) -> Indices:
-    """Owned nodes of a part of the mesh, or the one at a point if this rank owns it ``(n,)`` (collective).
+    """Owned nodes of a part of the mesh, or the node at a point if this rank owns it ``(n,)`` (collective).
 
     Args:
         config: configuration of the displacement.
         where: a tag of any dimension, ``(meshtags, value)``, a list of these, or reference coordinates ``(gdim,)``.
-        role: what the place is, for messages.
+        role: description of the place in messages.
         dims: dimensions that a tag may have; None for any.
 
     Raises:
-        TagError: if the part is empty, or none.
-        InputError: if no node is at the point, naming the nearest.
+        TagError: if the part is empty or invalid.
+        InputError: if no node is at the point, with the nearest node.
     """
     if is_point(where):
         return _node_at(config, given.vector(role, where, config.gdim), role)
@@ -60,7 +60,7 @@ def described(where: Any) -> str:
 
 def _node_at(config: Configuration, point: Array, role: str) -> Indices:
     distance = np.linalg.norm(config.X[: config.n_owned] - point, axis=1)
-    # two of each rank are enough to tell the nearest two of all
+    # the two nearest nodes are among the two nearest of each rank
     nearest = np.argsort(distance, kind="stable")[:2]
     offers = np.full((2, 1 + config.gdim), np.inf)
     offers[: len(nearest)] = np.column_stack([distance[nearest], config.X[nearest]])
@@ -80,22 +80,22 @@ def _node_at(config: Configuration, point: Array, role: str) -> Indices:
 
 
 def global_nodes(config: Configuration, nodes: Indices) -> Ints:
-    """Global numbers of the owned nodes of all ranks, known to every one ``(n,)`` (collective)."""
+    """Global numbers of the owned nodes of all ranks, on every rank ``(n,)`` (collective)."""
     return np.concatenate(config.comm.allgather(config.to_global(nodes)))
 
 
 def partners(config: Configuration, points: Array, nodes: Indices) -> tuple[Ints, Array, Array]:
-    """Which of some nodes is at each point (collective).
+    """The nearest of some nodes at each point (collective).
 
-    All ranks know the nodes' places meanwhile: they are those of a surface, not of a mesh.
+    The nodes' positions are gathered on all ranks, since they belong to a surface only.
 
     Args:
         config: configuration of the displacement.
         points: of this rank ``(n, gdim)``.
-        nodes: owned ones.
+        nodes: owned nodes.
 
     Returns:
-        Global numbers of the nearest nodes ``(n,)``, how far they are, and how far the next ones are ``(n,)``.
+        Global numbers of the nearest nodes ``(n,)``, their distances, and the distances of the second nearest ones ``(n,)``.
     """
     from scipy.spatial import cKDTree
 
@@ -108,6 +108,6 @@ def partners(config: Configuration, points: Array, nodes: Indices) -> tuple[Ints
 
 
 def middle_of(config: Configuration, nodes: Indices) -> Array:
-    """Mean place of the owned nodes of all ranks ``(gdim,)`` (collective)."""
+    """Mean position of the owned nodes of all ranks ``(gdim,)`` (collective)."""
     sums = reduced(config.comm, np.append(config.X[nodes].sum(axis=0), float(len(nodes))), op=MPI.SUM)
     return np.asarray(sums[:-1] / sums[-1])

@@ -1,4 +1,4 @@
-"""A set of nodes and a point that goes with them: how they move as one rigid body, and what a force and a moment at the point are for them.
+"""A set of nodes with a point: its motion as one rigid body, and nodal forces equivalent to a force and a moment at the point.
 
 With weights w of sum 1, the middle ``m = sum w x`` and arms ``r = x - m``, a force f and a moment t at the point p become
 

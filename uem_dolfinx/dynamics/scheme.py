@@ -1,4 +1,4 @@
-"""How displacement, velocity and acceleration of a time step belong together."""
+"""Time integration: relations between displacement, velocity and acceleration of a time step."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from uem_dolfinx.errors import InputError
 
 @dataclass(frozen=True)
 class Scheme:
-    """How displacement, velocity and acceleration of a step belong together.
+    """Relations between displacement, velocity and acceleration of a time step.
 
-    With G the static residual without contact forces, a step from n to n + 1 of length dt obeys
+    With G the static residual without contact forces, a step from n to n + 1 of length dt satisfies
 
-        (1 - alpha_f) G(n+1) + alpha_f G(n) + M ((1 - alpha_m) a(n+1) + alpha_m a(n)) = contact forces, averaged likewise
+        (1 - alpha_f) G(n+1) + alpha_f G(n) + M ((1 - alpha_m) a(n+1) + alpha_m a(n)) = contact forces, averaged as G
         u(n+1) = u(n) + dt v(n) + dt^2 ((1/2 - beta) a(n) + beta a(n+1))
         v(n+1) = v(n) + dt ((1 - gamma) a(n) + gamma a(n+1))
 
@@ -49,11 +49,11 @@ class Scheme:
         return (1.0 - self.alpha_m) / (1.0 - self.alpha_f) * (1.0 / (self.beta * dt**2))
 
     def ending(self, v: Array, a: Array, dt: float) -> tuple[float, Array, float, Array]:
-        """How a step of length ``dt`` from velocity v and acceleration a ends.
+        """Coefficients for the end of a step of length ``dt`` from velocity v and acceleration a.
 
         Returns:
-            Rate and past, with ``a(n+1) = rate (u(n+1) - u(n)) + past``, then those of ``v(n+1)`` likewise; the difference of
-            displacements keeps the digits.
+            Rate and past, with ``a(n+1) = rate (u(n+1) - u(n)) + past``, and the same two for ``v(n+1)``. Differences of displacements
+            reduce rounding.
         """
         a_rate = 1.0 / (self.beta * dt**2)
         a_past = -v / (self.beta * dt) - (0.5 / self.beta - 1.0) * a
@@ -61,11 +61,11 @@ class Scheme:
 
 
 def newmark(beta: float = 0.25, gamma: float = 0.5) -> Scheme:
-    """Newmark's rule; by default the trapezoidal rule, which keeps the energy of linear bodies [UEM, 5].
+    """Newmark's method; by default the trapezoidal rule, which conserves the energy of linear bodies [UEM, 5].
 
     Args:
         beta: weight of the new acceleration in the displacement.
-        gamma: the same in the velocity; more than 1/2 damps, at the price of first order.
+        gamma: weight of the new acceleration in the velocity; values above 1/2 add damping, but reduce the order to 1.
 
     Raises:
         InputError, InputTypeError: if beta is not positive or gamma below 1/2.
@@ -74,10 +74,10 @@ def newmark(beta: float = 0.25, gamma: float = 0.5) -> Scheme:
 
 
 def generalised_alpha(rho_inf: float) -> Scheme:
-    """Second-order rule that damps what the step cannot resolve (Chung and Hulbert, J. Appl. Mech. 60, 1993, 371-375).
+    """Second-order method that damps unresolved high frequencies (Chung and Hulbert, J. Appl. Mech. 60, 1993, 371-375).
 
     Args:
-        rho_inf: factor by which a step reduces the fastest motions, from 0 to 1 (no damping).
+        rho_inf: spectral radius at infinite frequency, from 0 to 1 (no damping).
 
     Raises:
         InputError, InputTypeError: if ``rho_inf`` is not between 0 and 1.

@@ -1,6 +1,6 @@
-"""How contact pressures change with contact forces, displacement and shape, at the state that a contact is in; and the transpose.
+"""Derivatives of contact pressures by contact forces, displacement and shape, at the present state; and their transpose.
 
-A pressure is a force over an area, ``p = lam / A``. With lam, which multipliers of the equations make, and A, both by what surrounds the
+A pressure is a force over an area, ``p = lam / A``. With lam from the multipliers of the equations, and A from the facets around the
 contactor,
 
     p' = lam' / A - p A' / A + p s'
@@ -28,10 +28,10 @@ class PressureWeights(NamedTuple):
     """Derivative of ``sum w_i p_i``.
 
     Attributes:
-        multipliers: by those of the pair's equations ``(m,)``.
-        areas: functional whose derivatives by displacement and shape are those through the areas; None of points, which have none.
-        now: by the places of the owned nodes ``(n_owned, gdim)``, forces and ``areas`` being the same.
-        drawn: likewise by the places where they were drawn, those where they are being the same.
+        multipliers: by the multipliers of the pair's equations ``(m,)``.
+        areas: functional whose derivatives by displacement and shape are the derivatives through the areas; None for points.
+        now: by the present positions of the owned nodes ``(n_owned, gdim)``, at fixed forces and ``areas``.
+        drawn: by the reference positions of the owned nodes ``(n_owned, gdim)``, at fixed present positions.
     """
 
     multipliers: Array
@@ -48,7 +48,7 @@ class PressureSlopes:
         equations: of its pair, in the present state.
 
     Raises:
-        InputError: if a concave corner holds contactors: their pressures are those of several facets, whose normals turn; likewise at sharp
+        InputError: if a concave corner holds contactors, whose pressures come from several facets with rotating normals; also at sharp
             edges of contactors, without mortar.
     """
 
@@ -90,9 +90,9 @@ class PressureSlopes:
         """Changes of the pressures of this rank's contactors ``(n,)`` (collective).
 
         Args:
-            multipliers: changes of those of the pair's equations ``(m,)``.
+            multipliers: changes of the multipliers of the pair's equations ``(m,)``.
             du: change of the displacement, and of all other fields.
-            shape: of the places of the nodes where they were drawn, in the displacement's space.
+            shape: change of the reference positions of the nodes, in the displacement's space.
         """
         config, nodes, p = self._config, self._pair.nodes, self._pressures
         lam, areas = self._pair.forces(self._equations, multipliers).lam, np.zeros(len(nodes))

@@ -1,4 +1,4 @@
-"""Return in finite strain with kinematic hardening, whose back stress is elastic in the plastic strain, at many points at once.
+"""Return mapping in finite strain with kinematic hardening, with a back stress that is elastic in the plastic strain.
 
 [Ortiz and Stainier, Computer Methods in Applied Mechanics and Engineering 171 (1999) 419-444, for the incremental potential; Bhatia,
 Positive Definite Matrices, ch. 6, for the geometry]
@@ -29,23 +29,23 @@ def kinematic_return(
 ) -> Flowed:
     """Return to the yield surface around the back stress ``2/3 modulus ln(V_p)``, V_p the plastic stretch.
 
-    The plastic strain is the one at which
+    The plastic strain minimises
 
         mu |dev ln(V_e)|^2 + 1/3 modulus |ln(V_p)|^2 + integral of the yield stress over peeq
 
-    is least. With ``C_p = F_p^T F_p`` these are distances of C_p from C, from 1 and from its committed value in the geometry of positive
-    tensors, in which such a sum is convex. It depends on C and C_p alone, and so neither on rotations nor on how F_p is turned. Where
-    all principal axes agree it is the radial return.
+    With ``C_p = F_p^T F_p`` these terms are distances of C_p from C, from 1 and from its committed value in the geometry of positive
+    tensors, in which such a sum is convex. It depends on C and C_p only, and so not on rotations, nor on the rotation in F_p. If all
+    principal axes agree it is the radial return.
 
-    Arguments are those of ``logarithmic_return``, and ``modulus (n,)``, the increase of the back stress in uniaxial tension per plastic
-    strain. So is what it returns, with NaN also where no return was found, and the back stress's part in ``energy``.
+    Arguments as in ``logarithmic_return``, and ``modulus (n,)``, the increase of the back stress in uniaxial tension per plastic strain.
+    Returns the same, with NaN also at points without convergence, and with the back stress's part in ``energy``.
     """
     F, one = gradient + np.eye(3), np.eye(3)
     C, committed = F.transpose(0, 2, 1) @ F, one - 2 * to_tensors(plastic_strain)
     i = np.flatnonzero(np.isfinite(C).all(axis=(1, 2)))
     i = i[np.linalg.det(F[i]) > 0]
     points = _Points(i, C[i], committed[i], mu[i], modulus[i], peeq[i])
-    # F_p^-1 but for a rotation, on which nothing depends
+    # F_p^-1 up to a rotation, on which nothing depends
     L = np.linalg.cholesky(committed[i])
     driving = points.driving(L)
     q = np.sqrt(1.5) * np.linalg.norm(driving, axis=(1, 2))
@@ -67,9 +67,9 @@ def kinematic_return(
 
 
 def _settled(points: _Points, curve: YieldCurve, L: Array) -> Array:
-    """Factors of ``C_p^-1`` where the potential is least, by Newton's method; NaN where it has not come to an end ``(m, 3, 3)``.
+    """Factors of ``C_p^-1`` at the minimum of the potential, by Newton's method; NaN without convergence ``(m, 3, 3)``.
 
-    Steps end below their part of the strains, or where they are rounding: so small that the next one must be far smaller, and it is not.
+    The iteration ends with steps below a part of the strains, or at rounding: small steps that no longer decrease.
     """
     L, left, last = L.copy(), np.arange(len(L)), np.full(len(L), np.inf)
     for _ in range(MAX_STEPS):
@@ -89,11 +89,11 @@ def _settled(points: _Points, curve: YieldCurve, L: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Step:
-    """Potential of a step in one state of flow, at m points.
+    """Derivatives of the potential of a step, at m points.
 
     Attributes:
-        slope: its derivative by further flow ``(m, 6)``.
-        hessian: its second one, regular by what resists a change of volume ``(m, 6, 6)``.
+        slope: first derivative by further flow ``(m, 6)``.
+        hessian: second derivative, made regular by a term for the change of volume ``(m, 6, 6)``.
         peeq: equivalent plastic strain ``(m,)``.
         size: of the strains ``(m,)``.
     """
@@ -108,15 +108,15 @@ class _Step:
 class _Points:
     """The potential of a step at m points as a function of a factor L of ``C_p^-1 = L L^T``.
 
-    Flow by a deviator S takes L to ``L exp(-S)``. It changes the elastic strain ``E = ln(L^T C L) / 2`` by ``-K(E) S``, the plastic
-    strain ``A = ln(V_p)`` by ``K(A) S`` and that of the step, D, by ``K(D) S``. In the principal axes of a strain e component ij of
-    ``K(e) S`` is ``h coth(h) S_ij`` with ``h = e_i - e_j``.
+    Flow by a deviator S changes L to ``L exp(-S)``. It changes the elastic strain ``E = ln(L^T C L) / 2`` by ``-K(E) S``, the plastic
+    strain ``A = ln(V_p)`` by ``K(A) S`` and the plastic strain of the step, D, by ``K(D) S``. In the principal axes of a strain e,
+    component ij of ``K(e) S`` is ``h coth(h) S_ij`` with ``h = e_i - e_j``.
 
     Attributes:
-        i: their numbers in the yield curve ``(m,)``.
+        i: numbers of the points in the yield curve ``(m,)``.
         C: right Cauchy-Green tensor ``(m, 3, 3)``.
         committed: ``C_p^-1`` ``(m, 3, 3)``.
-        mu, modulus, peeq: ``(m,)``, the last one as committed.
+        mu, modulus, peeq: ``(m,)``, with the committed peeq.
     """
 
     i: Ints
@@ -127,24 +127,24 @@ class _Points:
     peeq: Array
 
     def some(self, k: Ints) -> _Points:
-        """Those with these numbers."""
+        """The points with these numbers."""
         return _Points(*(getattr(self, field.name)[k] for field in fields(self)))
 
     def _elastic(self, L: Array) -> _Strain:
         return _Strain.of(L.transpose(0, 2, 1) @ self.C @ L)
 
     def _plastic(self, L: Array, since: Array) -> _Strain:
-        """What has flowed since ``C_p^-1`` was this."""
+        """Plastic strain since a state with ``C_p^-1 = since``."""
         back = np.asarray(np.linalg.inv(L), dtype=np.float64)
         return _Strain.of(back @ since @ back.transpose(0, 2, 1))
 
     def driving(self, L: Array) -> Array:
-        """Deviator of the stress less the back stress ``(m, 3, 3)``."""
+        """Deviator of the stress minus the back stress ``(m, 3, 3)``."""
         E, A = self._elastic(L), self._plastic(L, np.eye(3))
         return 2 * self.mu[:, None, None] * _deviator(E.tensor) - 2 / 3 * self.modulus[:, None, None] * A.tensor
 
     def step(self, L: Array, curve: YieldCurve) -> _Step:
-        """Its derivatives by flow from L."""
+        """Derivatives of the potential by flow from L."""
         E, A, D = self._elastic(L), self._plastic(L, np.eye(3)), self._plastic(L, self.committed)
         elastic, plastic, flow = (to_components(strain.tensor, 6) for strain in (E, A, D))
         length = np.linalg.norm(flow, axis=1)
@@ -163,7 +163,7 @@ class _Points:
         """Derivative of the slope by components of F ``(m, 6, c)``."""
         E, (rows, columns) = self._elastic(L), components
         turned = L @ E.axes
-        # Q^T dE Q with dE that of the elastic strain, by each component
+        # Q^T dE Q with the change dE of the elastic strain, for each component
         there, here = (F @ turned)[:, rows].transpose(1, 0, 2), turned[:, columns].transpose(1, 0, 2)
         change = there[..., :, None] * here[..., None, :]
         change = E.divided * (change + change.swapaxes(-1, -2)) / 2
@@ -174,7 +174,7 @@ class _Points:
 
 @dataclass(frozen=True)
 class _Strain:
-    """Half the logarithm of positive tensors: eigenvalues of these, of it, and the axes, ``(m, 3)``, ``(m, 3)`` and ``(m, 3, 3)``."""
+    """Half the logarithm of positive tensors: their eigenvalues ``(m, 3)``, its eigenvalues ``(m, 3)``, and axes ``(m, 3, 3)``."""
 
     squares: Array
     values: Array
@@ -182,13 +182,13 @@ class _Strain:
 
     @staticmethod
     def of(A: Array) -> _Strain:
-        """Of a tensor ``(m, 3, 3)``."""
+        """The strain of tensors ``(m, 3, 3)``."""
         squares, axes = np.linalg.eigh(A)
         return _Strain(squares, np.log(squares) / 2, axes)
 
     @property
     def tensor(self) -> Array:
-        """Itself ``(m, 3, 3)``."""
+        """The strain tensors ``(m, 3, 3)``."""
         return (self.axes * self.values[:, None, :]) @ self.axes.transpose(0, 2, 1)
 
     @property
@@ -220,7 +220,7 @@ def _deviator(A: Array) -> Array:
 
 
 def _exponential(A: Array) -> Array:
-    """Of symmetric tensors ``(m, 3, 3)``; NaN where they are not finite."""
+    """Exponential of symmetric tensors ``(m, 3, 3)``; NaN if they are not finite."""
     sound = np.isfinite(A).all(axis=(1, 2), keepdims=True)
     values, axes = np.linalg.eigh(np.where(sound, A, 0.0))
     return np.where(sound, (axes * np.exp(values)[:, None, :]) @ axes.transpose(0, 2, 1), np.nan)

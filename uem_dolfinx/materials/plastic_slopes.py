@@ -1,6 +1,6 @@
-"""How load steps of a law with history depend on the history that they began with, and on the law's parameters; backwards alone.
+"""Derivatives of load steps of a law with history by the initial history and by the law's parameters; in reverse mode only.
 
-Derivatives by fields at quadrature points are densities: per volume that belongs to the point.
+Derivatives by fields at quadrature points are densities: per volume of the point.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from uem_dolfinx.parallel import reduced
 
 
 class PlasticSlopes:
-    """Derivatives through the steps of one law, handed back from the last to the first (making one is collective).
+    """Derivatives through the steps of one law, from the last to the first (the constructor is collective).
 
     Args:
-        law: which knows what its return ``begins_with``, and the parameters it was ``handed``.
+        law: the law, with the initial values ``begins_with`` of its return and its parameters ``handed``.
         points: quadrature points of its stress.
-        stress, bulk: Functions that stand for its stress, and for its bulk modulus, in forms.
-        along: makes of a displacement the strain along it, an expression with the components of ``Returned``.
-        a: of the adjoint problem, a Function that strains are taken along.
+        stress, bulk: Functions of its stress, and of its bulk modulus, in forms.
+        along: returns the strain along a displacement, an expression with the components of ``Returned``.
+        a: adjoint displacement, a Function.
         test: test function of the displacement.
 
     Attributes:
-        stress, bulk: likewise.
+        stress, bulk: as given.
     """
 
     def __init__(
@@ -46,15 +46,15 @@ class PlasticSlopes:
         self._V, self._load = a.function_space, forms.form(ufl.dot(self._pulled, along(test)) * points.dx)
         n = points.volumes.size
         self._by_stress = np.zeros((n, size))
-        #: Derivatives by plastic strain and peeq, of the step's end, then of its beginning.
+        #: Derivatives by plastic strain and peeq at the end of the step, after ``pass_back`` at its beginning.
         self._by_history = np.zeros((n, size)), np.zeros(n)
         self._state: tuple[Array, ...] = ()
 
     def begin(self, by_stress: Array | None) -> None:
-        """Take the step that the law has been brought to the end of.
+        """Begin a step, with the law set to its end.
 
         Args:
-            by_stress: derivative of a functional by the owned values of ``stress``; None where it holds none.
+            by_stress: derivative of a functional by the owned values of ``stress``, or None.
         """
         self._state = self._law.begins_with()
         self._by_stress = np.zeros_like(self._by_stress)
@@ -64,12 +64,12 @@ class PlasticSlopes:
             self._by_stress = self._points.read(values) / self._points.volumes.reshape(-1, 1)
 
     def load(self) -> Array:
-        """Derivative through stress and history at the step's end by the owned displacement there ``(n,)`` (collective)."""
+        """Derivative by the owned displacement at the step's end ``(n,)``, through stress and history there (collective)."""
         self._points.write(self._pulled, self._back(*self._state, self._by_stress, *self._by_history).strain)
         return forms.assemble_array(self._V, self._load)
 
     def pass_back(self) -> ByReturn:
-        """Take derivatives by the history that the step began with, with a of the adjoint problem; returns all (collective)."""
+        """Compute derivatives by the initial history of the step, with the adjoint displacement a; returns all (collective)."""
         stress = self._by_stress - self._points.evaluate(self._along_a)
         by = self._back(*self._state, stress, *self._by_history)
         self._by_history = by.plastic_strain, by.peeq
@@ -80,11 +80,11 @@ class PlasticSlopes:
         return any(m is value for value in self._law.handed.values())
 
     def by_parameter(self, m: fem.Constant | fem.Function, by: ByReturn, by_bulk: fem.Function) -> Array | fem.Function:
-        """Derivative by a parameter, of its kind (collective).
+        """Derivative by a parameter, of its type (collective).
 
         Args:
-            m: as it was handed to the law.
-            by: as ``pass_back`` returned it.
+            m: the parameter as passed to the law.
+            by: as returned by ``pass_back``.
             by_bulk: derivative by the values of ``bulk``.
         """
         points, known = self._points, self._law.parameters

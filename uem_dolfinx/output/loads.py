@@ -1,4 +1,4 @@
-"""Loads for sketches: those that a load factor or time makes, and those that are terms of a residual, by what they are integrated over."""
+"""Loads for sketches: at a load factor or time, and from the terms of a residual, by domain of integration."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 def loads_of(problem: UnitedProblem, wanted: bool = True) -> tuple[Array, Array]:
-    """Nodal forces of what the residual integrates over surfaces of the undeformed bodies, and of all else in it (collective).
+    """Nodal forces of the residual's surface integrals on undeformed bodies, and of all its other integrals (collective).
 
-    Stresses are among the latter. On a body they have no resultant, so that sums over its nodes are what loads in its volume amount to.
+    The latter include stresses, which have no resultant on a body, so that sums over its nodes are resultants of volume loads.
 
     Args:
-        problem: the scene.
-        wanted: whether they are wanted; if not, they are zero.
+        problem: the problem.
+        wanted: whether to compute them; otherwise zero.
 
     Returns:
         Forces at the owned nodes ``(n_owned, gdim)`` each.
@@ -43,7 +43,7 @@ def loads_of(problem: UnitedProblem, wanted: bool = True) -> tuple[Array, Array]
 
 @contextmanager
 def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
-    """For a while, loads, Dirichlet values and rigid surfaces as ``load`` makes them at a load factor or time (collective)."""
+    """A block with loads, Dirichlet values and rigid surfaces set by ``load`` at a load factor or time (collective)."""
     if at is None:
         yield
         return
@@ -70,7 +70,7 @@ def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
 
 
 def _set_load(problem: UnitedProblem, at: float) -> None:
-    """What a problem's ``load`` and its couplings set at a load factor or time; nothing of contacts (collective)."""
+    """Set a problem's ``load`` and its couplings at a load factor or time, but not its contacts (collective)."""
     set_loads(problem.comm, problem.load, at)
     for one in problem.couplings:
         one.take_load(at)

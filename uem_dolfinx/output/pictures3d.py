@@ -48,7 +48,7 @@ class Look:
     Attributes:
         colours: matplotlib's colour map, with its number of colours.
         below: colour of values below 0; None is the first of the map.
-        box: bounds of what is looked at ``(3, 2)``.
+        box: bounds of the visible part ``(3, 2)``.
         cut: whether the surface is cut off at them.
         view: direction from the scene to the eye ``(3,)``.
         edges: draw the edges of the facets.
@@ -105,7 +105,7 @@ def images(faces: Ints, solids: Sequence[Solid], look: Look) -> list[Array]:
 
 
 def without_margins(found: Sequence[Array]) -> list[Array]:
-    """Images of the same size without what is empty on all of them."""
+    """Images of the same size without margins that are empty in all of them."""
     seen = np.any([image[..., 3] > 0 for image in found], axis=0)
     rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
     return [image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] for image in found]
@@ -152,7 +152,7 @@ def _image(faces: Ints, solid: Solid, look: Look) -> Array:
 
 
 def taken(plotter: Any, view: Array, box: Array) -> Array:
-    """The image of what is in a plotter, which is closed, from a direction ``(3,)``, so that a box ``(3, 2)`` fills it."""
+    """The image of a plotter, which is then closed, from a direction ``(3,)``, filled by a box ``(3, 2)``."""
     plotter.enable_anti_aliasing("ssaa")
     plotter.view_vector(view, screen(view)[1])
     plotter.reset_camera(bounds=box.ravel())

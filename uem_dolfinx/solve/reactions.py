@@ -1,4 +1,4 @@
-"""Forces with which Dirichlet conditions act."""
+"""Reaction forces of Dirichlet conditions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from uem_dolfinx.arrays import Array
 
 
 def reactions(problem: Any) -> Array:
-    """What holds a problem's bodies in its present state beside contacts and equations, at all unknowns ``(n,)`` (collective).
+    """Reactions of Dirichlet conditions in the present state, without contacts and equations, at all unknowns ``(n,)`` (collective).
 
-    Rounding where there is no condition, zero at ghosts; of other fields what flows in there.
+    Rounding at unknowns without condition, zero at ghosts; for other fields the flow into the body.
     """
     bodies, config = problem.bodies, problem.config
     bodies.assemble()
@@ -30,5 +30,5 @@ def reactions(problem: Any) -> Array:
 
 
 def owned_displacement(problem: Any) -> Any:
-    """Unknowns that the components of the owned nodes are ``(n_owned, gdim)``."""
+    """Unknowns of the components of the owned nodes ``(n_owned, gdim)``."""
     return problem.config.of(np.arange(len(problem.bodies.held)))[: problem.config.n_owned]

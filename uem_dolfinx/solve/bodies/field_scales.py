@@ -1,8 +1,8 @@
-"""What residuals of other fields are small beside, and what of them is rounding: told from the terms of their own equations.
+"""Reference sizes and rounding of residuals of other fields, from the terms of their own equations.
 
-A force is not a heat, and an equation as that of incompressibility has no reactions: beside the displacement, fields are measured by the
-terms ``K_ij w_j`` of their rows of K. What a row leaves of a constant counts once, as a sum, and what values differ from their mean in
-the row term by term, so that neither a rigid shift nor a temperature far from zero makes an equation seem solved.
+Fields have different units, and equations such as incompressibility have no reactions. So residuals of fields other than the displacement
+are compared with the terms ``K_ij w_j`` of their rows of K. Constants in a row count as one sum, deviations from the mean term by term, so
+that neither a rigid translation nor a temperature far from zero makes an equation seem solved.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class FieldScales:
         indptr, columns, _ = tangent.K.getValuesCSR()
         nodes, place = np.unique(columns // g, return_inverse=True)
         self._halo = Halo(unknowns, nodes.astype(np.int64))
-        #: Component of the columns looked at that each entry is in, and its row here.
+        #: Column of each entry among the fetched components, and its local row.
         column, row = place * g + columns % g, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
         field, kind = (self._halo.take(a.reshape(-1, g).__getitem__).ravel() for a in (unknowns.field, unknowns.kind))
-        #: Entries in equations of other fields, or of them in those of the displacement.
+        #: Entries in equations of other fields, and entries of other fields in equations of the displacement.
         self._which: Ints = np.flatnonzero(((unknowns.field[row] > 0) | (field[column] > 0)) & (field[column] >= 0))
         self._row, self._column = row[self._which], column[self._which]
         self._by_displacement = field[self._column] == 0
@@ -51,7 +51,7 @@ class FieldScales:
         return self._values, self._halo.take(rows.__getitem__).ravel()[self._column]
 
     def terms(self) -> Array:
-        """Norm of the terms in the equations of each field, none for the displacement ``(n_fields,)`` (collective)."""
+        """Norm of the terms in the equations of each field, zero for the displacement ``(n_fields,)`` (collective)."""
         K, w = self._known()
         weight, size = np.abs(K), len(self._unknowns.field) * self._kinds
         total, sums, weighted = (np.bincount(self._group, a, size) for a in (weight, K, weight * w))
@@ -65,7 +65,7 @@ class FieldScales:
         return norms
 
     def _largest(self) -> Array:
-        """Sum of the terms' sizes in every equation, of those with other fields in the displacement's ``(n_rows * gdim,)``."""
+        """Sum of the terms' sizes in every equation ``(n_rows * gdim,)``; in the displacement's only terms of other fields."""
         K, w = self._known()
         return np.asarray(np.bincount(self._row, np.abs(K * w), len(self._unknowns.field)), dtype=float)
 
@@ -74,9 +74,9 @@ class FieldScales:
         return self._unknowns.norms_of(self._largest())
 
     def strain_rounding(self, size: float) -> Array:
-        """Norm of what rounding of ``1 + grad(u)`` can make in the equations of each field, none for the displacement ``(n_fields,)``.
+        """Norm of residuals due to rounding of ``1 + grad(u)`` in the equations of each field, zero for the displacement ``(n_fields,)``.
 
-        An equation as ``det(1 + grad(u)) = 1`` is left with it however small u is. Collective; ``size`` is the model's, a length.
+        Equations such as ``det(1 + grad(u)) = 1`` have this residual for any small u. Collective; ``size`` is the model's, a length.
         """
         K, _ = self._known()
         of_displacement = np.where(self._by_displacement, np.abs(K), 0.0)
@@ -84,5 +84,5 @@ class FieldScales:
         return self._of_others(np.asarray(each, dtype=float))
 
     def above(self, F: Array, part: float) -> Array:
-        """Norm of the residual ``F (n_rows * gdim,)`` where it is more than a part of the terms, none for the displacement (collective)."""
+        """Norm of the residual ``F (n_rows * gdim,)`` where it exceeds a part of the terms, zero for the displacement (collective)."""
         return self._of_others(np.where(np.abs(F) > part * self._largest(), F, 0.0))
