@@ -1,4 +1,4 @@
-"""Which contacts of a problem are treated together: those that are alike but for surfaces and values."""
+"""Joint treatment of contacts of a problem that differ only in surfaces and values."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def join_alike(contacts: Sequence[Contact]) -> None:
-    """Treat contacts together that are alike, in a problem that is being made (collective).
+    """Join similar contacts during the set-up of a problem (collective).
 
-    They are contacts of nodes at finite sliding with meshes, at degree 1, with the same normals and thickness of the target's body,
-    without friction or with Coulomb's; without ties, wear and heat.
+    These are node-to-surface contacts of meshes with finite sliding, at degree 1, with the same normals and target thickness,
+    without friction or with Coulomb's law, without ties, wear and heat.
     """
     groups: dict[Hashable, list[Contact]] = {}
     for contact in contacts:
@@ -35,10 +35,10 @@ def join_alike(contacts: Sequence[Contact]) -> None:
 
 
 def part(contacts: Sequence[Contact]) -> list[tuple[Interface, list[Interface]]]:
-    """Give contacts that are treated together interfaces of their own again (collective).
+    """Separate joined contacts into their own interfaces again (collective).
 
     Returns:
-        What they were parts of, with these interfaces.
+        The joint interfaces, with the separate interfaces of each.
     """
     wholes = {id(contact.pair.whole): contact.pair.whole for contact in contacts}
     parted = [(whole, whole.part()) for whole in wholes.values() if len(whole.members) > 1]
@@ -53,7 +53,7 @@ def part(contacts: Sequence[Contact]) -> list[tuple[Interface, list[Interface]]]
 
 
 def _kind(contact: Contact) -> Hashable:
-    """What contacts that are treated together have in common; None for those that are not."""
+    """Common properties of contacts that can be joined; None for other contacts."""
     from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
     from uem_dolfinx.geometry.search import MeshTarget
 
@@ -67,6 +67,6 @@ def _kind(contact: Contact) -> Hashable:
 
 
 def _joins(friction: Sliding) -> bool:
-    """Whether friction is Coulomb's with values that do not follow a temperature, and wears nothing."""
+    """Whether friction is Coulomb's law, independent of temperature, and without wear."""
     law = friction.limits.law
     return type(law) is Coulomb and not isinstance(law.field, OfTemperature) and friction.wear is None

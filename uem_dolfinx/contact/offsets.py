@@ -1,4 +1,4 @@
-"""Offsets of gaps: surfaces that are taken to be thicker or thinner than they were drawn, and gaps that are taken to be closed."""
+"""Offsets of gaps: additional thickness of surfaces, and initial gaps that are treated as closed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Offsets:
-    """What the gaps of one interface are less than heights over the target.
+    """Heights minus gaps at the contactors of one interface.
 
     Args:
         pair: the interface.
@@ -26,8 +26,8 @@ class Offsets:
 
     Attributes:
         pair: likewise.
-        adjusted: heights of contactors that are taken to touch ``(n,)``.
-        worn: depths that have been worn off ``(n,)``.
+        adjusted: initial heights of contactors that are treated as touching ``(n,)``.
+        worn: wear depths ``(n,)``.
     """
 
     def __init__(self, pair: Interface, name: str):
@@ -37,13 +37,13 @@ class Offsets:
         self.worn: Array = np.zeros(len(pair.nodes))
 
     def set(self, offset: Field) -> None:
-        """Set an offset, in addition to adjusted and worn lengths; contactors are to be placed again (collective)."""
+        """Set an offset, in addition to adjusted and worn lengths; contactors must be placed again (collective)."""
         config, nodes, words = self.pair.config, self.pair.nodes, f"contact '{self._name}': offset"
         self._given = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
         self._hand_over()
 
     def wear(self, worn: Array) -> None:
-        """Take depths that have been worn off ``(n,)``; contactors are to be placed again (collective)."""
+        """Set wear depths ``(n,)``; contactors must be placed again (collective)."""
         self.worn = worn
         self._hand_over()
 
@@ -53,7 +53,7 @@ class Offsets:
         self.pair.set_offset(total if some else None)
 
     def adjust(self, reach: float | bool) -> None:
-        """Take contactors to touch that are no farther from the target, or above it, than ``reach`` (collective).
+        """Treat contactors with an initial gap or penetration of at most ``reach`` as touching (collective).
 
         Args:
             reach: a length; True is a side of a target's facet, or on a rigid surface the bound on the initial penetration.

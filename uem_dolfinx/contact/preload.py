@@ -1,4 +1,4 @@
-"""Preload: a bolt is cut at a section whose opening is one unknown that carries a given force, and is locked at the length found."""
+"""Preload: the opening of a bolt's section is an unknown with a given force, which is later locked."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from uem_dolfinx.parallel import agreed, ask_together
 
 
 class Preload(Contact):
-    """A section of a bolt, between two facing surfaces of its parts, that carries a given force, or keeps the length found with it.
+    """A section of a bolt, between two facing surfaces of its parts, with a given force or a locked opening.
 
     The surfaces are tied in all components except for an opening along the axis, which is uniform over the section. While the force
     is prescribed, the opening is an unknown: the parts approach, and may overlap, until the section carries the force to rounding.
-    ``lock`` keeps the opening from then on, so that the bolt is an elastic part as others.
+    ``lock`` keeps the opening from then on, so that the bolt is an ordinary elastic part.
 
-    It is a ``Contact`` with ``tied=True`` and has its results: ``force`` is the field of nodal forces on both faces, as of any contact,
-    and ``carried`` the force across the section.
+    It is a ``Contact`` with ``tied=True`` and has its results: ``force`` is the field of nodal forces on both faces, and
+    ``carried`` the force across the section.
 
     Args:
-        contactor: one face of the section, as of ``Contact``.
-        target: the other, of a mesh; the two need not match.
-        axis: direction of the bolt ``(gdim,)``, of any length and either sign; None is the section's mean normal. It stays as it is when
-            bodies turn.
-        force: force in the section, positive in tension: of the modelled part, so that half a bolt carries half of the force; on
-            axisymmetric meshes of the whole circle. A number acts in full from the first step on; a function is called with the
-            load factor, in time steps with the time.
-        coupling: as of ``Contact``.
-        measure: likewise.
-        name: likewise.
+        contactor: one face of the section, see ``Contact``.
+        target: the other face, on a mesh; the two need not match.
+        axis: direction of the bolt ``(gdim,)``, of any length and either sign; None is the section's mean normal. It does not
+            rotate with the bodies.
+        force: force in the section, positive in tension, of the modelled part: half of it for half a bolt, the full circle for
+            axisymmetry. A number acts in full from the first step on; a function is called with the load factor, in time steps with
+            the time.
+        coupling: see ``Contact``.
+        measure: see ``Contact``.
+        name: see ``Contact``.
 
     Raises:
         InputError, InputTypeError: for an invalid axis or force, or a rigid target.
@@ -74,7 +74,7 @@ class Preload(Contact):
         super().__init__(contactor, target, coupling=coupling, tied=True, measure=measure, name=name)
 
     def __repr__(self) -> str:
-        """Its name, coupling, and what it has been given."""
+        """Name, axis, force and coupling."""
         axis = "" if self._axis is None else f", axis={self._axis.tolist()}"
         return f"Preload({self.name!r}{axis}, force={given.shown(self._force)}, coupling={self.coupling!r})"
 
@@ -126,21 +126,21 @@ class Preload(Contact):
         return f"preload '{self.name}'"
 
     def words(self) -> dict[str, str]:
-        """As of ``Contact``, and the axis."""
+        """See ``Contact``; with the axis."""
         axis = "normal" if self._axis is None else " ".join(f"{a:.6g}" for a in self._axis)
         return super().words() | {"axis": axis}
 
     def switch(self, on: bool) -> None:
-        """Raise InputError: a section is not opened, it carries the force zero."""
+        """Raise InputError: a section cannot be switched off, only its force can be zero."""
         raise InputError(
             f"preload '{self.name}' cannot be switched: it carries no force with Step(..., preload={{preload: 0.0}})"
         )
 
     def attach(self, config: Configuration, free: Bools, **clock: Any) -> Interface:
-        """As of ``Contact``; also (collective).
+        """See ``Contact``; in addition (collective).
 
         Raises:
-            InputError: if the axis is of another dimension, or leaves that of an axisymmetric mesh, or lies in the section.
+            InputError: if the axis has another dimension, differs from the axis of symmetry, or lies in the section.
         """
         with agreed(config.comm):
             if self._axis is not None:
@@ -160,17 +160,17 @@ class Preload(Contact):
 
     @property
     def sees_corners(self) -> bool:
-        """No: faces that overlap initially are inside the other part."""
+        """False, since faces that overlap initially are inside the other part."""
         return False
 
     def take_load(self, at: float, known: bool = False) -> None:
-        """As of ``Contact``, and the force (collective)."""
+        """See ``Contact``; also updates the force (collective)."""
         super().take_load(at, known)
         if callable(self._force):
             self._take_force()
 
     def _take_force(self) -> None:
-        """Hand the force that belongs to the present load factor or time to the pair (collective)."""
+        """Set the force of the present load factor or time in the pair (collective)."""
         force = self._force
         if callable(force):
             words = f"{self._words}: force({self._at:.6g})"

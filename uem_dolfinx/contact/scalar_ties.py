@@ -1,8 +1,8 @@
-"""Ties of a scalar field, as a temperature, between meshes that do not match: linear equations by the weights that tie displacements.
+"""Ties of a scalar field, such as a temperature, between non-matching meshes: linear equations with the weights of displacement ties.
 
     u_i = sum_a w_a u_a        for every contactor i that is within reach of the target
 
-The weights are those of ``tied_rows`` where the surfaces are: shape functions at the foot, or means over segments by dual functions.
+The weights are those of ``tied_rows``: shape functions at the closest point, or means over segments by dual functions.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from uem_dolfinx.geometry.nodes import Halo
 
 
 def check_ties(gdim: int, contacts: Sequence[Any], equations: Sequence[Any], **others: Any) -> None:
-    """Refuse what a scalar field cannot have: contacts that are no ties of two meshes, and what is of displacements.
+    """Refuse contacts of a scalar field other than ties of two meshes, and options for displacements.
 
     Args:
         gdim: dimension of the mesh.
         contacts: of the problem.
-        equations: likewise; a scalar field with neither is taken for a displacement by mistake.
-        others: what else it was handed by name; None, or nothing in it, will do.
+        equations: of the problem; without contacts and equations, a scalar field is taken for a wrong displacement.
+        others: other arguments by name; they must be None or empty.
 
     Raises:
-        SpaceError, InputError: naming it.
+        SpaceError, InputError: naming the first such argument.
     """
     others_than_ties = [one for one in contacts if getattr(one, "tied", False) is not True or hasattr(one.target, "project")]
     if others_than_ties or not (contacts or equations):
@@ -58,18 +58,18 @@ class ScalarTie:
 
     Args:
         config: nodes of the scalar field.
-        contact: the tie, which is taken by the problem.
-        free: which nodes have no Dirichlet condition ``(n_owned, 1)``.
+        contact: the tie, marked as part of the problem.
+        free: nodes without Dirichlet condition ``(n_owned, 1)``.
 
     Attributes:
-        followed: owned nodes of the target, to be eliminated only where no contactor can be.
+        followed: owned nodes of the target, eliminated only if no contactor of the equation can be.
     """
 
     firm = False
     b = 0.0
 
     def __init__(self, config: Configuration, contact: Contact, free: Bools):
-        # surfaces and segments are those of a displacement that is zero, whose nodes are at the same places with other numbers
+        # surfaces and segments belong to a zero displacement, with the same nodes in another numbering
         still = Configuration(fem.Function(compat.function_space(config.mesh, config.degree, (config.gdim,))))
         place = np.zeros(still.n_local, dtype=np.int64)
         place[compat.cell_dofs(still.V)] = compat.cell_dofs(config.V)
@@ -89,7 +89,7 @@ class ScalarTie:
         order = np.argsort(rows, kind="stable")
         weights: Array = np.concatenate([np.ones(len(tied)), -weight[kept, 0]])
         found = GivenRows(np.zeros(len(tied), np.int64), rows[order], np.concatenate([own, theirs])[order], weights[order, None])
-        # where conditions prescribe both sides, they differ by what the meshes make of the values, and there is nothing to tie
+        # if conditions prescribe both sides, interpolated values differ and there is no equation
         able = np.zeros(len(tied), dtype=bool)
         able[found.row[(sizes(config, found, free) > 0).any(axis=1)]] = True
         self._rows = found.select(able)

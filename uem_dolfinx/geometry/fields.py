@@ -1,7 +1,7 @@
-"""A displacement that is one part of a mixed space: which unknowns of the space are its nodes', and in which rows all others stand.
+"""A displacement that is one part of a mixed space: numbering of its nodes, and of the unknowns of all other fields.
 
-Vectors and matrices of the united system have rows of gdim components each. On every rank the displacement's nodes come first, then the
-unknowns of all other fields, as many to a row as a node has components; the last row is filled up with components that are held.
+Vectors and matrices of the constrained system have rows of gdim components. On every rank the displacement's nodes come first, then
+the unknowns of all other fields, gdim per row; the last row is padded with fixed components.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from uem_dolfinx.parallel import Exchange, agreed, gathered, reduced
 
 
 class ConfigurationAmongFields(Configuration):
-    """Nodes of a displacement that is one part of a mixed space, and where they are now (collective).
+    """Nodes of a displacement that is one part of a mixed space, and their current positions (collective).
 
     Args:
         w: Function of the mixed space.
         displacement: number of the part, of vector Lagrange elements of degree 1 or 2.
 
     Attributes:
-        dofs: local unknowns of w that the components of the local nodes are ``(n_local, gdim)``.
+        dofs: local unknowns of w for the components of the local nodes ``(n_local, gdim)``.
 
     Raises:
-        InputTypeError, InputError, SpaceError: if w is of no mixed space, or has no such part, or that is no displacement.
+        InputTypeError, InputError, SpaceError: if w has no mixed space or no such part, or if the part is not a displacement.
     """
 
     def __init__(self, w: fem.Function, displacement: int):
@@ -44,14 +44,14 @@ class ConfigurationAmongFields(Configuration):
             degree = degree_of_displacement(W, displacement)
         given.alike(W.mesh.comm, "UnitedProblem", displacement=displacement)
         self.whole, self.part, self.u = w, int(displacement), ufl.split(w)[displacement]
-        # numbered as a space of its own, which surfaces and results are of
+        # numbered as a separate space, for surfaces and results
         V = compat.function_space(W.mesh, degree, (W.mesh.geometry.dim,))
         self._take(V)
         nodes, own = compat.cell_dofs(V), compat.part_dofs(W, self.part)
         self.dofs: Ints = np.zeros((self.n_local, self.gdim), dtype=np.int64)
         if len(nodes):
             self.dofs[nodes.ravel()] = own.reshape(-1, self.gdim)
-        #: ``NodalField`` of other parts by their number, as far as these were asked for.
+        #: ``NodalField`` of other parts by their number, made when needed.
         self.nodal_fields: dict[int, Any] = {}
         self._unknowns = Unknowns(self)
         first = np.append(self._first_nodes[:-1], np.iinfo(np.int64).max)
@@ -64,7 +64,7 @@ class ConfigurationAmongFields(Configuration):
 
     @property
     def unknowns(self) -> Unknowns:
-        """The rows that vectors and matrices have."""
+        """Rows of vectors and matrices."""
         return self._unknowns
 
     def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
@@ -72,30 +72,30 @@ class ConfigurationAmongFields(Configuration):
         return self._rows[nodes]
 
     def of(self, values: AnyArray) -> Any:
-        """Values of the displacement ``(n_local, gdim)`` among those of all unknowns, ghosts included ``(n,)``."""
+        """Values of the displacement ``(n_local, gdim)`` from values of all unknowns including ghosts ``(n,)``."""
         return values[self.dofs]
 
     def rows(self, values: AnyArray) -> Any:
-        """Owned values of all unknowns ``(n,)`` in the rows of vectors ``(n_rows, gdim)``, zero where these are filled up."""
+        """Owned values of all unknowns ``(n,)`` in the rows of vectors ``(n_rows, gdim)``, padded with zeros."""
         out = np.zeros(self.gdim * self._unknowns.n_owned, values.dtype)
         out[self._unknowns.place] = values
         return out.reshape(-1, self.gdim)
 
     def from_rows(self, rows: Array) -> Array:
-        """Owned values of all unknowns ``(n,)`` of a vector's ``rows (n_rows * gdim,)``."""
+        """Owned values of all unknowns ``(n,)`` from a vector's ``rows (n_rows * gdim,)``."""
         return rows[self._unknowns.place]
 
     def add_to(self, values: AnyArray, of_nodes: Array) -> None:
-        """Add what the owned nodes of the displacement have ``(n_owned * gdim,)`` to owned values of all unknowns ``(n,)``."""
+        """Add values at the owned nodes of the displacement ``(n_owned * gdim,)`` to owned values of all unknowns ``(n,)``."""
         values[self.dofs[: self.n_owned].ravel()] += of_nodes
 
     def in_rows(self, matrix: PETSc.Mat) -> PETSc.Mat:
-        """A matrix of the displacement with the rows and columns that vectors have, zero in those of other fields (collective)."""
+        """A matrix of the displacement extended to all rows and columns, with zeros for other fields (collective)."""
         (start, columns, values), g, rows = matrix.getValuesCSR(), self.gdim, self._unknowns
         ends = np.asarray(matrix.getOwnershipRanges(), dtype=np.int64)
         rank = np.searchsorted(ends, columns, side="right") - 1
         columns = columns - ends[rank] + g * rows._first_nodes[rank]
-        # with a diagonal everywhere, as solvers want it
+        # with all diagonal entries, which solvers need
         more = np.arange(g * self.n_owned, g * rows.n_owned)
         start = np.append(start, start[-1] + 1 + np.arange(len(more)))
         columns, values = np.append(columns, g * rows.first + more), np.append(values, np.zeros(len(more)))
@@ -104,7 +104,7 @@ class ConfigurationAmongFields(Configuration):
         return PETSc.Mat().createAIJ((size, size), bsize=g, csr=csr, comm=self.comm)
 
     def place_of(self, unknown: int) -> str:
-        """Which component of which node a local unknown is, or of which other part of the space, for error messages."""
+        """Component and node of a local unknown, or its other part of the space, for error messages."""
         node, component = np.nonzero(self.dofs == unknown)
         if len(node):
             return f"{'xyz'[component[0]]} at {self.describe(node[0])}"
@@ -114,7 +114,7 @@ class ConfigurationAmongFields(Configuration):
 
     @cached_property
     def _parts(self) -> dict[str, tuple[fem.Function, Ints]]:
-        """Functions of the parts by name, and the unknowns of w that they have (first time: collective)."""
+        """Functions of the parts by name, with their unknowns of w (first time: collective)."""
         W, found = self.whole.function_space, {"displacement": (fem.Function(self.V, name="displacement"), self.dofs.ravel())}
         for i in range(W.num_sub_spaces):
             if i != self.part:
@@ -123,40 +123,40 @@ class ConfigurationAmongFields(Configuration):
         return found
 
     def functions(self) -> dict[str, fem.Function]:
-        """The displacement and all other fields, ``field_1`` of part 1, as Functions of their own, up to date (first call: collective)."""
+        """The displacement and all other fields (part 1 is ``field_1``) as separate, current Functions (first call: collective)."""
         found = {name: f for name, (f, _) in self._parts.items()}
         self.fill(found, self.whole.x.array)
         return found
 
     def fill(self, functions: Mapping[str, fem.Function], values: Array) -> None:
-        """Write values of all unknowns, ghosts included ``(n,)``, to Functions that are like those of ``functions``."""
+        """Write values of all unknowns including ghosts ``(n,)`` to Functions as in ``functions``."""
         for name, (_, dofs) in self._parts.items():
             functions[name].x.array[:] = values[dofs]
 
     def values_of(self, functions: Mapping[str, fem.Function]) -> Array:
-        """Values of all unknowns, ghosts included ``(n,)``, from Functions that are like those of ``functions``."""
+        """Values of all unknowns including ghosts ``(n,)`` from Functions as in ``functions``."""
         values = np.zeros(len(self.whole.x.array))
         for name, (_, dofs) in self._parts.items():
             values[dofs] = functions[name].x.array
         return values
 
     def shift(self, nodes: Any, way: Array) -> None:
-        """Move local nodes ``(n,)``, each named once, or all of a slice, by a way ``(n, gdim)``; ghosts are not told."""
+        """Move distinct local nodes ``(n,)``, or a slice, by ``way (n, gdim)``; ghosts are not updated."""
         self.whole.x.array[self.dofs[nodes]] += way
 
 
 class Unknowns(Nodes):
-    """Rows of the united system of a mixed space: nodes of the displacement, then the unknowns of all other fields (collective).
+    """Rows of the constrained system of a mixed space: nodes of the displacement, then the unknowns of all other fields (collective).
 
     Args:
-        config: nodes of the displacement, whose numbers are not yet those of the rows.
+        config: nodes of the displacement, in their own numbering.
 
     Attributes:
-        place: component of a vector that each owned unknown of the mixed space is ``(n,)``.
-        numbers: likewise over all ranks, of each local unknown, ghosts included.
+        place: vector component of each owned unknown of the mixed space ``(n,)``.
+        numbers: vector component over all ranks of each local unknown, including ghosts.
         n_fields: number of parts of the mixed space.
-        field: which part each component is of, the displacement 0 and the others in their order ``(n_owned * block,)``; -1 is none.
-        kind: number of the part's component, alike for all that can be averaged ``(n_owned * block,)``.
+        field: field of each component, 0 for the displacement, others in their order ``(n_owned * block,)``; -1 for padding.
+        kind: number of the part's component, equal for components that can be averaged ``(n_owned * block,)``.
     """
 
     mixed = True
@@ -180,11 +180,11 @@ class Unknowns(Nodes):
         self._label(W, n)
 
     def _label(self, W: Any, n: int) -> None:
-        """Tell fields and their components apart."""
+        """Set ``field`` and ``kind`` of all components."""
         self.n_fields = W.num_sub_spaces
         field, kind = np.full((2, len(self.numbers)), -1)
         order = [self.config.part, *(i for i in range(self.n_fields) if i != self.config.part)]
-        #: Of the parts in solvers' options, the displacement's first.
+        #: Names of the parts in solver options, the displacement first.
         self.names = ["u", *map(str, order[1:])]
         count = 0
         for number, i in enumerate(order):
@@ -195,21 +195,21 @@ class Unknowns(Nodes):
             count += width
         self.field, self.kind = np.full((2, self.block * self.n_owned), -1)
         self.field[self.place], self.kind[self.place] = field[:n], kind[:n]
-        #: Field of every local unknown of the mixed space, ghosts included.
+        #: Field of every local unknown of the mixed space, including ghosts.
         self.field_of: Ints = field
 
     def norms(self, v: PETSc.Vec) -> Array:
-        """Norm of each field's part of a vector, the displacement's first ``(n_fields,)`` (collective)."""
+        """Norm of each field's part of a vector, the displacement first ``(n_fields,)`` (collective)."""
         return self.norms_of(v.array_r)
 
     def norms_of(self, values: Array) -> Array:
-        """Likewise of the owned components ``(n_owned * block,)`` (collective)."""
-        # of no components they would be integers
+        """Norm of each field's part from owned components ``(n_owned * block,)`` (collective)."""
+        # for empty arrays the result would have integer type
         squares = np.bincount(self.field + 1, values**2, self.n_fields + 1)[1:].astype(float)
         return np.sqrt(np.asarray(reduced(self.comm, squares)))
 
     def work(self, q: PETSc.Vec, F: PETSc.Vec) -> float:
-        """Work of forces along an increment, that of the displacement alone (collective)."""
+        """Work of forces in an increment, for the displacement only (collective)."""
         n = self.block * self.config.n_owned
         return float(reduced(self.comm, float(q.array_r[:n] @ F.array_r[:n])))
 
@@ -218,13 +218,13 @@ class Unknowns(Nodes):
         return np.asarray(nodes, dtype=np.int64) + self.first
 
     def describe(self, node: int) -> str:
-        """Where an owned row's node is, for error messages."""
+        """Position of an owned row's node, for error messages."""
         return self.config.describe(node) if node < self.config.n_owned else "an unknown of another field"
 
     def create_matrix(self, a: Any) -> PETSc.Mat:
-        """Matrix for a compiled bilinear form of the mixed space, into which DOLFINx assembles by its own numbers (collective).
+        """Matrix for a compiled bilinear form of the mixed space, with a map from DOLFINx's numbering (collective).
 
-        All components of a row have entries in the same rows' columns, as those of a node have.
+        All components of a row have the same block columns, as for nodes.
         """
         there = forms.create_matrix(a)
         forms.assemble_matrix(there, a)
@@ -249,7 +249,7 @@ class Unknowns(Nodes):
         return K
 
     def _numbers_of(self, unknowns: Ints) -> Ints:
-        """Components of vectors, over all ranks, that DOLFINx's global ``unknowns (k,)`` of any rank are (collective)."""
+        """Vector components, over all ranks, of DOLFINx's global ``unknowns (k,)`` of any rank (collective)."""
         first = gathered(self.comm, int(self._map.local_range[0]))
         asking = Exchange.to(self.comm, np.searchsorted(first, unknowns, side="right") - 1)
         (asked,) = asking.send(unknowns)
@@ -258,11 +258,11 @@ class Unknowns(Nodes):
         return found
 
     def multipliers(self, A: PETSc.Mat) -> int:
-        """Number of unknowns of other fields without stiffness of their own, or with a negative one (collective)."""
+        """Number of unknowns of other fields with zero or negative diagonal (collective)."""
         return int(reduced(self.comm, int(((A.getDiagonal().array_r <= 0.0) & (self.field > 0)).sum())))
 
     def complete(self, K: PETSc.Mat, free: Bools) -> None:
-        """Put 1 on the diagonal of K where it is zero and components are held, which P crosses out ``(n_owned, block)`` (collective)."""
+        """Set zero diagonal entries of K to 1 for fixed components, which P eliminates ``(n_owned, block)`` (collective)."""
         diagonal = K.getDiagonal()
         idle = ~free.ravel() & (diagonal.array_r == 0.0)
         diagonal.array[idle] = 1.0

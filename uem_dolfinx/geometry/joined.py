@@ -1,4 +1,4 @@
-"""Surfaces of many targets as one: each point sees the facets of its own surface alone, and one search finds all closest points."""
+"""Joint search on the surfaces of many targets, each point on its own surface."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from uem_dolfinx.parallel import Exchange
 class JoinedFacets(TargetFacets):
     """Facets of several surfaces, one surface after the other on each rank (collective).
 
-    A facet of two surfaces stands here twice. Normals at nodes are means over facets of one surface.
+    A facet of two surfaces occurs twice. Normals at nodes are averages over facets of one surface.
 
     Args:
         config: configuration of the displacement.
-        surfaces: that are joined, S of them.
+        surfaces: the S joined surfaces.
 
     Attributes:
         surface: number of the surface of each facet ``(m,)``.
@@ -44,20 +44,20 @@ class JoinedFacets(TargetFacets):
         self.surface: Ints = np.repeat(np.arange(len(surfaces)), sizes)
         every = np.empty((config.comm.size, len(surfaces)), dtype=sizes.dtype)
         config.comm.Allgather(sizes, every)
-        #: First facet of every surface among those of every rank, and numbers over all ranks as each surface alone has them.
+        #: First facet of every surface on every rank, and first numbers of each surface's own numbering.
         self._begin = np.cumsum(every, axis=1) - every
         self._alone = np.concatenate([np.zeros((1, len(surfaces)), int), np.cumsum(every, axis=0)])
         self._apart = self._without_common_nodes(len(surfaces))
 
     def _without_common_nodes(self, n: int) -> list[Bools]:
-        """Facets in classes of surfaces that have no node in common, on any rank ``(m,)`` each (collective)."""
+        """Facets in classes of surfaces without common nodes on any rank, ``(m,)`` each (collective)."""
         rows = np.unique(np.column_stack([self.nodes.ravel(), np.repeat(self.surface, self.nodes.shape[1])]), axis=0)
         node, surface = Exchange.to(self.config.comm, self.config.owner_of(rows[:, 0])).send(*rows.T)
         meet = np.zeros((n, n), dtype=bool)
         order = np.lexsort((surface, node))
         node, surface = node[order], surface[order]
         for step in range(1, n):
-            # nodes of few surfaces have few rows
+            # the number of passes is limited by the surfaces per node
             same = node[step:] == node[:-step]
             if not same.any():
                 break
@@ -70,7 +70,7 @@ class JoinedFacets(TargetFacets):
         return [number[self.surface] == c for c in range(number.max(initial=0) + 1)]
 
     def _summed(self, vectors: Array) -> Array:
-        """See ``TargetFacets``, over facets of one surface (collective)."""
+        """See ``TargetFacets``; sums over facets of one surface (collective)."""
         field, found = self._normal_field, np.empty(vectors.shape)
         nodal = field.x.array.reshape(-1, self.config.gdim)
         for own in self._apart:
@@ -81,7 +81,7 @@ class JoinedFacets(TargetFacets):
         return found
 
     def spread(self) -> Array:
-        """See ``TargetFacets``, of facets of one surface (collective)."""
+        """See ``TargetFacets``; for facets of one surface (collective)."""
         parts, found = self._areas_beside(), np.empty(self.dofs.shape)
         for own in self._apart:
             rows, dofs = parts[own].reshape(-1, self.config.gdim + 1), self.dofs[own]
@@ -89,31 +89,31 @@ class JoinedFacets(TargetFacets):
         return found
 
     def alone(self, facet: Ints, surface: int) -> Ints:
-        """Numbers among the facets of one surface alone of its facets numbered here ``facet (...)``, -1 for -1."""
+        """Numbers in a surface's own numbering of facets with joint numbers ``facet (...)``, -1 for -1."""
         return _renumbered(facet, self.first, self._begin[:, surface], self._alone[:, surface], 0 * self._begin[:, surface])
 
     def here(self, facet: Ints, surface: int) -> Ints:
-        """The other way round."""
+        """Inverse of ``alone``."""
         return _renumbered(facet, self._alone[:, surface], 0 * self._begin[:, surface], self.first, self._begin[:, surface])
 
 
 def _renumbered(facet: Ints, first: Ints, begin: Ints, other_first: Ints, other_begin: Ints) -> Ints:
-    """Numbers that begin on each rank at ``first + begin`` as they are if they begin at ``other_first + other_begin``."""
+    """Convert numbers that begin on each rank at ``first + begin`` to numbers that begin at ``other_first + other_begin``."""
     rank = np.searchsorted(first, facet, side="right") - 1
     there = np.maximum(rank, 0)
     return np.asarray(np.where(facet < 0, -1, facet - first[there] - begin[there] + other_first[there] + other_begin[there]))
 
 
 class JoinedTarget(MeshTarget):
-    """Targets of many contacts: each contactor is projected onto its own (collective).
+    """Targets of many contacts: each contactor is projected onto its own target (collective).
 
     Args:
-        facets: of all of them.
-        averaged: as of ``MeshTarget``.
+        facets: of all targets.
+        averaged: see ``MeshTarget``.
         surface: number of the surface that each contactor may touch ``(n,)``.
 
     Attributes:
-        asked: contactors that are looked at ``(n,)``; the others have nothing near.
+        asked: contactors that are projected ``(n,)``; others get the projection ``nowhere``.
     """
 
     facets: JoinedFacets
@@ -123,7 +123,7 @@ class JoinedTarget(MeshTarget):
         self._surface, self.asked = surface, np.ones(len(surface), dtype=bool)
 
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
-        """Closest points of contactors on their own targets; far away where they are not looked at (collective)."""
+        """Closest points of contactors on their own targets; ``nowhere`` for contactors that are skipped (collective)."""
         asked = self.asked if which is None else self.asked[which]
         surface = (self._surface if which is None else self._surface[which])[asked]
         nearest = self.project_onto(points[asked], surface)
@@ -132,7 +132,7 @@ class JoinedTarget(MeshTarget):
         return self.nowhere(points).with_those(np.flatnonzero(asked), nearest)
 
     def project_onto(self, points: Array, surface: Ints) -> FacetProjection:
-        """Closest points of ``points (k, gdim)`` each on the surface numbered ``surface (k,)`` (collective)."""
+        """Closest points of ``points (k, gdim)`` on the surfaces numbered ``surface (k,)`` (collective)."""
         data, size = self.facets.current(corners=True), self.comm.size
         if size == 1:
             return self._evaluate(points, self._nearest_here(points, surface, data))
@@ -149,12 +149,12 @@ class JoinedTarget(MeshTarget):
         return self._nearest_foot(points, rows, Feet._make(map(np.concatenate, zip(more, feet))))[0]
 
     def _answers(self, exchange: Exchange, points: Array, surface: Ints, data: FacetData) -> Feet:
-        """Feet that the ranks of an exchange find on their facets, in the order of its rows (collective)."""
+        """Closest points on the facets of the ranks of an exchange, in the order of its rows (collective)."""
         p, asked = exchange.send(points, surface)
         return Feet._make(exchange.back(*self._nearest_here(p, asked, data)))
 
     def _nearest_here(self, points: Array, surface: Ints, data: FacetData) -> Feet:
-        """Feet on this rank's facets of each point's surface."""
+        """Closest points on this rank's facets of each point's surface."""
         return self._on_nearest(points, data, *candidate_pairs(self.shape, data.x, points, surface, self.facets.surface))
 
     def _bounds(self, points: Array, surface: Ints, x: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""A scalar field of a mixed space at the nodes of the displacement beside it, of whose degree it need not be."""
+"""A scalar field of a mixed space at the nodes of the displacement, possibly of lower degree."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from uem_dolfinx.geometry.fields import ConfigurationAmongFields
 
 
 class NodalField:
-    """Values of a field at nodes, each the combination of the unknowns of one cell with its shape functions there.
+    """Values of a field at nodes, interpolated from the unknowns of one cell with its shape functions.
 
     Args:
         config: displacement among other fields.
         part: number of the field in the mixed space.
-        what: asks for the field, for messages.
+        what: user of the field, for messages.
 
     Attributes:
-        unknowns: local unknowns of the mixed space that the value at each local node takes ``(n_local, k)``.
-        weights: by which it does ``(n_local, k)``.
+        unknowns: local unknowns of the mixed space for the value at each local node ``(n_local, k)``.
+        weights: weights of these unknowns ``(n_local, k)``.
 
     Raises:
-        InputError, SpaceError: if the space has no such part beside the displacement, or it is no scalar Lagrange field of the degree
-            of that or less.
+        InputError, SpaceError: if the space has no such part, or if it is not a scalar Lagrange field of at most the displacement's
+            degree.
     """
 
     def __init__(self, config: ConfigurationAmongFields, part: int, what: str):
@@ -35,10 +35,10 @@ class NodalField:
         degree = _degree(config, part, what)
         cell = compat.cell_name(config.mesh)
         points = forms.create_lagrange_element(cell, config.degree).points
-        # eighths of one, of degree 1 at nodes of degree 2, or ones
+        # values are multiples of 1/8, for degree 1 at nodes of degree 2, or 1
         shape = np.rint(8.0 * forms.create_lagrange_element(cell, degree).tabulate(0, points)[0, :, :, 0]) / 8.0
         nodes, own = compat.cell_dofs(config.V), compat.part_dofs(W, part)
-        # nodes of a cell follow those of its unknowns that count there, the largest first
+        # unknowns of the cell by their weight at each node, the largest first
         k = int((shape != 0).sum(axis=1).max())
         order = np.argsort(-np.abs(shape), axis=1, kind="stable")[:, :k]
         self.unknowns: Ints = np.zeros((config.n_local, k), dtype=np.int64)
@@ -49,16 +49,16 @@ class NodalField:
 
     @property
     def values(self) -> Array:
-        """At the owned nodes ``(n_owned,)``."""
+        """Values at the owned nodes ``(n_owned,)``."""
         n = self.config.n_owned
         return np.asarray((self.weights[:n] * self.config.whole.x.array[self.unknowns[:n]]).sum(axis=1))
 
     def terms(self, nodes: Ints) -> Array:
-        """Components of vectors over all ranks that the values at owned ``nodes (m,)`` take, then their weights ``(m, 2 k)``."""
+        """Global vector components for the values at owned ``nodes (m,)``, followed by their weights ``(m, 2 k)``."""
         return np.column_stack([self.config.unknowns.numbers[self.unknowns[nodes]], self.weights[nodes]])
 
     def rows(self, nodal: Array) -> Array:
-        """What ``nodal (n_owned,)`` amounts are in the field's equations, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        """Nodal amounts ``nodal (n_owned,)`` as terms of the field's equations, in rows of vectors ``(n_rows * gdim,)`` (collective)."""
         from dolfinx import fem
 
         n, sent = self.config.n_owned, fem.Function(self.config.whole.function_space)
@@ -68,7 +68,7 @@ class NodalField:
 
 
 def nodal_field(config: ConfigurationAmongFields, part: int, what: str) -> NodalField:
-    """The field of a part at nodes, made once; arguments and errors as of ``NodalField``."""
+    """The field of a part at nodes, made once; arguments and errors as for ``NodalField``."""
     if part not in config.nodal_fields:
         config.nodal_fields[part] = NodalField(config, part, what)
     found: NodalField = config.nodal_fields[part]
@@ -76,7 +76,7 @@ def nodal_field(config: ConfigurationAmongFields, part: int, what: str) -> Nodal
 
 
 def _degree(config: Any, part: int, what: str) -> int:
-    """Degree of the field, which must be one that nodes of the displacement tell."""
+    """Degree of the field, which must not exceed the displacement's degree."""
     W = config.whole.function_space
     others = [i for i in range(W.num_sub_spaces) if i != config.part]
     if part not in others:

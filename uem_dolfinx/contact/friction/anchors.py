@@ -1,4 +1,4 @@
-"""Where contactors with friction are held on the target, and how far they have moved over it. Functions of arrays."""
+"""Anchors of frictional contactors on the target, and their relative motion. Functions of arrays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from uem_dolfinx.geometry.search import MeshTarget
 def anchored(
     f: FrictionState, kinematics: Kinematics, target: Target, points: Array, loose: Bools, kept_feet: bool
 ) -> FrictionState:
-    """The state in which contactors that do not stick are anchored where they are.
+    """The state in which contactors that do not stick get anchors at their current position.
 
     Args:
         f: state of friction.
@@ -26,7 +26,7 @@ def anchored(
         target: that they are anchored to.
         points: positions of the contactors ``(n, gdim)``.
         loose: contactors that do not stick ``(n,)``.
-        kept_feet: whether feet stay where they were at the start of the step, so that contactors leave them behind.
+        kept_feet: whether closest points are constant during the step, so that contactors move away from them.
     """
     p = kinematics.projection
     below = points - p.height[:, None] * p.normal
@@ -46,12 +46,12 @@ def anchored(
 
 
 def anchors_of(f: FrictionState, target: Target, terms: bool) -> tuple[Array, tuple[Ints, Ints, Array] | None]:
-    """Where contactors are anchored on the target where it is now ``(n, gdim)``, and which nodes move these places (collective).
+    """Current positions of the anchors on the target ``(n, gdim)``, and the nodes that they follow (collective).
 
     Args:
         f: state of friction.
         target: that they are anchored to.
-        terms: whether contactors, global nodes and weights ``(k,)`` of a mesh are asked for.
+        terms: whether to return contactors, global nodes and weights ``(k,)`` for a mesh.
     """
     if isinstance(target, MeshTarget):
         N, facets = target.shape.tabulate(f.xi).N, target.facets
@@ -66,13 +66,13 @@ def anchors_of(f: FrictionState, target: Target, terms: bool) -> tuple[Array, tu
 
 
 def way_since(config: Configuration, nodes: Indices, before: Array, motion: Motion | None, now: Motion | None) -> Array:
-    """Way of the owned nodes ``(n_owned, gdim)`` since they were at ``before``; of contactors less that of a rigid target.
+    """Displacement of the owned nodes ``(n_owned, gdim)`` since ``before``; for contactors relative to a rigid target.
 
     Args:
         config: configuration of the displacement.
         nodes: contactors ``(n,)``.
         before: positions ``(n_owned, gdim)``.
-        motion: of the target then; None if it had not moved.
+        motion: motion of the target then; None if it had not moved.
         now: its motion now.
     """
     way = config.x[: config.n_owned] - before

@@ -1,4 +1,4 @@
-"""How much force along the target contactors bear: a law of friction where contactors are, by their forces, areas and speeds of slip."""
+"""Limits of friction at contactors from a law, by normal forces, areas and slip speeds."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Limits:
     """Limits of friction of the contactors of one interface.
 
     Args:
-        areas: of the contactors' reference surface towards what they touch ``(n,)``, of normals ``(n, gdim)``, asked for by laws that
-            need them; before contactors have been placed, for None, all of it (collective).
+        areas: function of target normals ``(n, gdim)`` that returns reference areas facing the target ``(n,)``, for laws that need
+            them; for None, before the first placement, total areas (collective).
         duration: length of the present step, a time; None in statics.
 
     Attributes:
-        law: of friction.
-        value: of its parameter at the contactors ``(n,)``.
-        area: that ``lam`` is an integral of the pressure over ``(n,)``; zeros unless the law needs it.
-        speed: of slip in the present step ``(n,)``; zeros unless the law needs it.
+        law: friction law.
+        value: parameter of the law at the contactors ``(n,)``.
+        area: area of ``lam`` as an integral of the pressure ``(n,)``; zeros unless the law needs it.
+        speed: slip speed in the present step ``(n,)``; zeros unless the law needs it.
     """
 
     law: FrictionLaw
@@ -35,37 +35,37 @@ class Limits:
 
     def __init__(self, areas: Callable[[Array | None], Array], duration: Callable[[], float] | None):
         self.areas_of, self.duration = areas, duration
-        #: Forces along the normal that limits stay with while these change ``(n,)``.
+        #: Normal forces at which limits are fixed ``(n,)``, or None.
         self._held: Array | None = None
 
     def set(self, law: FrictionLaw, value: Array) -> Array:
-        """Take a law, and the values of its parameter ``(n,)``: the slopes of the cones of contactors that do not press (collective)."""
+        """Set a law and the values of its parameter ``(n,)``; returns the slopes of the cones at zero force (collective)."""
         self.law = law
         self.area = self.areas_of(None) if law.per_area else np.zeros(len(value))
         self.speed = np.zeros(len(value))
         return self.change(value)
 
     def change(self, value: Array) -> Array:
-        """Take other values of the parameter ``(n,)``; returns as ``set`` does."""
+        """Set other values of the parameter ``(n,)``; returns the same as ``set``."""
         self.value = value
         return self.law.limit(value, np.zeros(len(value)), self.area)[1]
 
     def grow(self, kinematics: Kinematics) -> None:
-        """Take the areas where contactors are now (collective)."""
+        """Update the areas to the current placement (collective)."""
         if self.law.per_area:
             self.area = kinematics.pressure_map(False).areas(self.areas_of(kinematics.projection.normal))
 
     def see(self, way: Array) -> None:
-        """Take how far contactors have slipped in the present step ``(n,)``."""
+        """Set the slip of contactors in the present step ``(n,)``, for the speed."""
         dt = 0.0 if self.duration is None else self.duration()
         if of_rate(self.law) and dt > 0.0:
             self.speed = way / dt
 
     def hold(self, lam: Array | None) -> Array:
-        """Let limits be those of forces ``lam (n,)`` along the normal whatever these become, as in Tresca's law; None lets them follow.
+        """Fix the limits at normal forces ``lam (n,)``, as in Tresca's law; None makes them depend on the force again.
 
         Returns:
-            By how much a limit that was held has changed at most, and the largest one, on this rank ``(2,)``.
+            Largest change of a fixed limit, and the largest limit, on this rank ``(2,)``.
         """
         before, self._held = self._held, None if lam is None else np.maximum(lam, 0.0)
         if self._held is None:
@@ -75,7 +75,7 @@ class Limits:
         return np.array([change.max(initial=0.0), now.max(initial=0.0)])
 
     def of(self, lam: Array, slips: Bools) -> tuple[Array, Array, Array]:
-        """Limits at forces ``lam (n,)`` along the normal of contactors of which some slip, and derivatives with ``lam`` and the slip."""
+        """Limits at normal forces ``lam (n,)``, of which some contactors slip, and derivatives by ``lam`` and the slip."""
         lam = np.maximum(lam, 0.0) if self._held is None else self._held
         limit, slope = self._stuck(lam)
         rate = np.zeros_like(limit)
@@ -87,7 +87,7 @@ class Limits:
         return limit, slope if self._held is None else np.zeros_like(slope), rate
 
     def cone(self, lam: Array, slips: Bools) -> tuple[Array, Array]:
-        """Limits as linear functions of the force along the normal, about ``lam (n,)``: their values at 0 and slopes ``(n,)``."""
+        """Limits as linear functions of the normal force, about ``lam (n,)``: values at 0 and slopes ``(n,)``."""
         limit, slope, _ = self.of(lam, slips)
         rest = limit - slope * np.maximum(lam, 0.0)
         return np.where(np.abs(rest) > ROUNDING * limit, rest, 0.0), slope

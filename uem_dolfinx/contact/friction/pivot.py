@@ -1,4 +1,4 @@
-"""What exchanges of a linearised problem have done to stick and slip, and what a step's end is to the next step."""
+"""Record of stick-slip exchanges of a linearised problem, and data of the last step's end."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Pivot:
-    """What the exchanges of one linearised problem have done, and what directions of slip come from, ``(n,)`` each or as told.
+    """Record of the exchanges of one linearised problem, and data of slip directions, ``(n,)`` unless stated.
 
     Attributes:
-        released: contactors that have been let go of.
-        turned: those whose slip has been turned back.
-        begun: those that have begun to slip.
-        taken: those that slip ahead of others.
-        stiffness: c.
-        q: forces that the directions of slip have ``(n, gdim)``.
-        tau: of these the part that is force ``(n, gdim)``.
-        front: where contactors begin to slip.
+        released: contactors that have been released.
+        turned: contactors whose slip has been reversed.
+        begun: contactors that have begun to slip.
+        taken: contactors that slip in advance.
+        stiffness: stiffness c.
+        q: forces that define the slip directions ``(n, gdim)``.
+        tau: force part of ``q`` ``(n, gdim)``.
+        front: slip front.
     """
 
     released: Bools
@@ -41,17 +41,17 @@ class Pivot:
 
     @classmethod
     def begin(cls, front: Front, stiffness: Array, q: Array, tau: Array) -> Pivot:
-        """Nothing is done yet."""
+        """The record before the first exchange."""
         none = np.zeros(len(stiffness), dtype=bool)
         return cls(none, none, none, none, stiffness, q, tau, front)
 
 
 @dataclass(frozen=True)
 class LastStep:
-    """What contactors that follow others in a mean did at the end of the last step.
+    """Data of the last step's end, for contactors that follow other nodes in a mean.
 
     Attributes:
-        ties: by what they followed.
+        ties: weights of followed nodes.
         x: positions of the owned nodes ``(n_owned, gdim)``.
         motion: of a rigid target; None if it had not moved.
         force_per_multiplier: see ``Kinematics``.

@@ -1,4 +1,4 @@
-"""Forces of contactors along the normal times the ways that they have slid under them: what wears."""
+"""Normal forces of contactors times sliding distances, for wear."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from uem_dolfinx.contact.seam.state import PairState
 def force_times_way(
     frame: Frame, at: Kinematics, states: tuple[PairState, PairState], tau: Array, ways: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Force along the normal times way over a step, for the force at its start and the one at its end ``(n,)`` each.
+    """Normal force times sliding distance of a step, with the force at its start and at its end, ``(n,)`` each.
 
     Args:
-        frame: directions along the target at the end.
-        at: where contactors are then.
-        states: at the start and at the end.
+        frame: tangential directions at the end of the step.
+        at: kinematics at the end of the step.
+        states: states at the start and at the end.
         tau: friction at the end ``(n, gdim)``.
-        ways: past the target over the whole step, for a unit of the force at its start and at its end ``(n, gdim)`` each.
+        ways: relative motion in the step, per unit of force at its start and at its end ``(n, gdim)`` each.
     """
     begin, end = states
     assert begin.friction is not None
@@ -29,8 +29,8 @@ def force_times_way(
 
 
 def _one(frame: Frame, at: Kinematics, states: tuple[PairState, PairState], of: PairState, tau: Array, way: Array) -> Array:
-    """For the forces of one of the states."""
-    # one that leaves a corner slides over the facet that it leaves it by, which bears what is along its normal
+    """The product with the forces of one of the states."""
+    # a contactor that leaves a corner slides over one facet, which carries the force along its normal
     push = np.where(of.in_corner, np.einsum("ng,ng->n", at.normal, of.force - tau), of.lam)
     rubbed, c = push * np.linalg.norm(frame.along(way), axis=1), at.corners
     if c is not None:

@@ -1,4 +1,4 @@
-"""Slip that eats its way along a surface, one contactor an exchange, and takes others ahead with it."""
+"""Slip front that propagates along a surface; contactors ahead of it slip in advance, to save exchanges."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NEARER = 0.25
 
 
 class Front:
-    """Where contactors begin to slip, and how far ahead of them others go along.
+    """Position of the slip front, and the distance ahead of it within which contactors slip in advance.
 
     Args:
         comm: communicator.
@@ -31,20 +31,20 @@ class Front:
         self._reach = 0.0
 
     def along(self, begin: Bools, back: Bools, force: Array, points: Array) -> tuple[Bools, Array]:
-        """Which contactors go along with those that ``begin (n,)``, if some ``back (n,)`` are held again, as ``move`` (collective)."""
+        """Contactors that slip in advance of those that ``begin (n,)``; ``back (n,)`` stick again; see ``move`` (collective)."""
         return self.move(points[begin], force[begin], bool(back.any()), points)
 
     def move(self, here: Array, force: Array, too_far: bool, points: Array) -> tuple[Bools, Array]:
-        """Which contactors go along, at first as far ahead as slip has come, and the forces they take over (collective).
+        """Contactors that slip in advance, at first as far ahead as the front has moved, and their forces (collective).
 
         Args:
-            here: where this rank's contactors begin to slip ``(k, gdim)``.
-            force: on these ``(k, gdim)``.
-            too_far: whether some of this rank that went along last have been held again.
-            points: where this rank's contactors are ``(n, gdim)``.
+            here: positions at which this rank's contactors begin to slip ``(k, gdim)``.
+            force: forces on these contactors ``(k, gdim)``.
+            too_far: whether contactors of this rank that slipped in advance stick again.
+            points: positions of this rank's contactors ``(n, gdim)``.
 
         Returns:
-            Those that go along ``(n,)``, and the force on the nearest that begins to slip ``(n, gdim)``, zero for the others.
+            Contactors that slip in advance ``(n,)``, and the force of the nearest that begins to slip ``(n, gdim)``, zero for others.
         """
         begin, back = reduced(self._comm, np.array([len(here), too_far]))
         if not begin:
@@ -55,7 +55,7 @@ class Front:
         return np.isfinite(distance), taken
 
     def _come(self, here: Array) -> float:
-        """How far slip has come since the last time; zero the first (collective)."""
+        """Distance of the front from its last position; zero at first (collective)."""
         if self._last is None:
             return 0.0
         _, far = box_distances(self._comm, here, self._last)

@@ -1,4 +1,4 @@
-"""Wear of contactors: what slip under pressure takes from the surface in a step, as a depth at its nodes, by which gaps are larger."""
+"""Wear of contactors: depth removed by slip under pressure in a step, which increases gaps."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ MOST_WORN = 2.0
 class Wear:
     """Wear of the contactors of one interface by Archard's law.
 
-    A force wears a volume at its contactor. The depth is the combination of the contactor's shape functions with these volumes as its
-    integrals with the functions that forces belong to, the shape functions, or Bernstein's on surfaces of degree 2.
+    Each contact force removes a volume at its contactor. The depth, a combination of the shape functions, has these volumes as its
+    integrals with the basis of the forces: shape functions, or the Bernstein basis at degree 2.
 
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         k: coefficient of wear over hardness.
         tag: the contactor.
-        areas: of its nodes.
-        lower: lets gaps be larger by depths ``(n,)``; contactors are then to be placed again.
+        areas: areas of its nodes.
+        lower: function that increases gaps by depths ``(n,)``; contactors must be placed again afterwards.
         name: of the contact, for messages.
 
     Attributes:
         k: coefficient at the contactors ``(n,)``.
 
     Raises:
-        InputError, UserFunctionError: if contactors are points, or if a function of place is no good.
+        InputError, UserFunctionError: if contactors are points, or if a function of position is invalid.
     """
 
     def __init__(
@@ -73,27 +73,27 @@ class Wear:
         self._integrals = config.to_owners(self._dofs.ravel(), own.ravel())[nodes]
 
     def _at_facets(self, values: Array) -> Array:
-        """Values at the contactors ``(n,)`` at the nodes of this rank's facets ``(m, nn)`` (collective)."""
+        """Values of contactors ``(n,)`` at the nodes of this rank's facets ``(m, nn)`` (collective)."""
         return self._config.from_owners(self._nodes, values[:, None], self._dofs.ravel()).reshape(self._dofs.shape)
 
     def depths(self, start: Array, end: Array) -> Array:
-        """Depths at nodes that a step wears off ``(n,)``; arguments as of ``worn_volume`` (collective)."""
+        """Wear depths of a step at nodes ``(n,)``; arguments as for ``worn_volume`` (collective)."""
         volume = worn_volume(self.k, start, end)
         nodal = self._at_facets(volume / self._integrals) @ self._to_nodes.T
         return np.asarray(self._config.to_owners(self._dofs.ravel(), nodal.ravel())[self._nodes] / self._count)
 
     def apply(self, state: PairState) -> None:
-        """Let gaps be larger by what a state has worn; contactors are to be placed again (collective)."""
+        """Increase gaps by the wear of a state; contactors must be placed again (collective)."""
         assert state.friction is not None
         self._lower(state.friction.worn)
 
     def volume(self, state: PairState) -> float:
-        """Volume that a state has worn over all ranks (collective)."""
+        """Worn volume of a state over all ranks (collective)."""
         assert state.friction is not None
         return float(reduced(self._config.comm, float(self._areas @ state.friction.worn)))
 
     def look_at_step(self, before: PairState, now: PairState, normal: Array, stiffness: Array) -> None:
-        """Warn, once, if a step has worn contactors by more than they spring back (collective).
+        """Warn, once, if the wear depth of a step exceeds the elastic recovery of contactors (collective).
 
         Args:
             before: state at its start.

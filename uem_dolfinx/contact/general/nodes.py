@@ -1,4 +1,4 @@
-"""Nodes to the surfaces of many bodies: the discretisation of general contact."""
+"""Node-to-surface discretisation of general contact between many bodies."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from uem_dolfinx.parallel import reduced
 
 
 class AmongBodies(NodeToSurface):
-    """Implements ``Discretisation``: nodes against the facets that they may touch, of any bodies."""
+    """Implements ``Discretisation``: nodes with the listed facets of any bodies."""
 
     target: Neighbour
 
     def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.ordered_by = target.neighbours.number
-        # of two edges that meet, the one that is over the other's facet follows it
+        # of two edges in contact, the node above a facet of the other body follows it
         self.ends_hold = ~target.neighbours.skin.corners[nodes]
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
@@ -34,23 +34,23 @@ class AmongBodies(NodeToSurface):
         return super().place(points, state)
 
     def _asks(self, state: PairState) -> bool:
-        """Whether lists have anything, or a contactor is active, on any rank (collective)."""
+        """Whether the list has a pair, or a contactor is active, on any rank (collective)."""
         return not self.target.nothing_near() or reduced(self.config.comm, bool(state.active.any()), op=MPI.LOR)
 
     def begin_step(self) -> None:
-        """Lists are those that the step began with."""
+        """Begin or repeat a step with the lists of its beginning."""
         super().begin_step()
         self.target.neighbours.begin_step()
 
     def look_farther(self) -> bool:
-        """Reach four times as far: whether that is not beyond the whole model yet."""
+        """Extend the reach by a factor of 4; False if it already exceeds the size of the model."""
         return self.target.number == 0 and self.target.neighbours.look_farther()
 
     def commit(self) -> None:
-        """Nodes are in front of facets from where they are now."""
+        """Accept a step: current positions decide which side of facets nodes are on."""
         super().commit()
         self.target.neighbours.commit()
 
 
 class AmongQuadraticBodies(AmongBodies, Bernstein):
-    """The same with control gaps, of degree 2."""
+    """The same with control gaps, for degree 2."""

@@ -1,4 +1,4 @@
-"""Friction of a general contact by pairs of surfaces: what contactors have is told by what they touch, wherever they are placed."""
+"""Friction of a general contact by pairs of surfaces: each contactor's value depends on the touched surface."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from uem_dolfinx.contact.laws.law import FrictionLaw, as_law, follows_load, give
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.skin import Skin
 
-#: Who has a part: the local nodes, and this rank's facets.
+#: Local nodes and this rank's facets of a part.
 Place = tuple[Bools, Bools]
 
 
 class FrictionOfPairs:
-    """What is given by pairs: one law, with values of its parameter for each of them and for all others.
+    """User input of friction by pairs: one law, with a value for each pair and one for all others.
 
     Args:
         friction: ``{(one, other): value, ..., None: value of all others}``; names of bodies, parts, and one of each pair may be a rigid
             surface.
 
     Raises:
-        InputError, InputTypeError: for a key that is no pair, values that are no friction, or that are of several laws.
+        InputError, InputTypeError: for a key that is not a pair, invalid values, or values of different laws.
     """
 
     def __init__(self, friction: dict[Any, Any]):
-        #: Of what no pair names, which has none unless it is told.
+        #: Friction of pairs that are not listed, zero by default.
         self.others = as_law(given_friction(friction.get(None, 0.0)))
         self.pairs = [(*self._pair(key), as_law(given_friction(value))) for key, value in friction.items() if key is not None]
         laws = [law for *_, law in self.pairs] + [self.others] * (None in friction)
@@ -53,17 +53,17 @@ class FrictionOfPairs:
         return (key[1], key[0]) if hasattr(key[0], "project") else key
 
     def against(self, target: Any) -> list[tuple[Any, Any, FrictionLaw]]:
-        """The pairs with this rigid surface; those without any for None."""
+        """The pairs with this rigid surface; for None, the pairs without rigid surface."""
         return [p for p in self.pairs if (p[1] is target if target is not None else not hasattr(p[1], "project"))]
 
 
 class ValuesOfPairs:
-    """Values of the law's parameter at the contactors of one contact, by what they touch (collective).
+    """Values of the law's parameter at the contactors of one contact, by the touched surface (collective).
 
     Args:
         skin: surfaces of the bodies.
-        friction: what is given by pairs.
-        where: the place of a part.
+        friction: user input by pairs.
+        where: function that returns nodes and facets of a part.
         target: a rigid surface; None for the bodies.
         name: of the contact.
     """
@@ -74,14 +74,14 @@ class ValuesOfPairs:
         firsts = [where(one) for one, _, _ in friction.against(target)]
         seconds = [where(other) for _, other, _ in friction.against(target)] if target is None else []
         none = np.zeros((self.config.n_local, 0), bool), np.zeros((len(skin.dofs), 0), bool)
-        #: Nodes of each pair's first, then of its second ``(n_local, 2 k)``, and facets of those that they are against ``(m, 2 k)``;
-        #: against a rigid surface of the first alone.
+        #: Nodes of each pair's first part, then of its second ``(n_local, 2 k)``, and facets of the opposite parts ``(m, 2 k)``;
+        #: for a rigid surface only the first.
         self._nodes = np.column_stack([none[0], *(nodes for nodes, _ in (*firsts, *seconds))])
         self._facets = np.column_stack([none[1], *(facets for _, facets in (*seconds, *firsts))])
         self._rigid = target is not None
 
     def at(self, nodes: Indices) -> Array:
-        """Values of each pair, and last of all others, at the contactors ``(n, k + 1)``; kept for ``now`` (collective)."""
+        """Values of each pair, and in the last column of all others, at the contactors ``(n, k + 1)``; stored for ``now`` (collective)."""
         columns = []
         for law in (*self._laws, self._others):
             value = values_at(law, self.config, nodes, self._name, True, 0.0)
@@ -90,13 +90,13 @@ class ValuesOfPairs:
         return self.values
 
     def now(self, facet: Ints) -> Array:
-        """Values ``(n,)`` of contactors that are on facets of these numbers over all ranks ``(n,)``, -1 for none (collective)."""
+        """Values ``(n,)`` of contactors on facets with these global numbers ``(n,)``, -1 for no facet (collective)."""
         k, meets = len(self._laws), self._own
         if not self._rigid:
             both = meets & (self.skin.values_at(facet, self._facets.astype(np.int64)) > 0)
             meets = both[:, :k] | both[:, k:]
         value = self.values[:, -1].copy()
-        # the first pair that holds counts
+        # the first matching pair is used
         for j in reversed(range(k)):
             value[meets[:, j]] = self.values[meets[:, j], j]
         return value

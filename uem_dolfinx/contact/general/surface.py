@@ -1,4 +1,4 @@
-"""Parts of the surfaces of a general contact: all that may touch something, and which nodes and facets users name."""
+"""Surfaces of a general contact: facets that may touch, and nodes and facets of users' parts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from uem_dolfinx.parallel import reduced
 
 
 def is_pair(one: Any) -> bool:
-    """Whether this is a pair of parts, rather than one."""
+    """Whether this is a pair of parts, not a single part."""
     return (
         isinstance(one, tuple) and len(one) == 2 and not hasattr(one[0], "indices") and not isinstance(one[0], int | np.integer)
     )
@@ -37,13 +37,13 @@ def as_part(config: Configuration, part: Part, role: str) -> Tag:
 
 
 def touching_surface(config: Configuration, surfaces: Part | None, without: Sequence[Tag]) -> Tag:
-    """The facets that may touch something (collective)."""
+    """The facets that may touch others (collective)."""
     mesh, facets = config.mesh, config.tdim - 1
     if surfaces is None:
         mesh.topology.create_connectivity(facets, config.tdim)
         surfaces = np.asarray(exterior_facet_indices(mesh.topology))
         if config.axisymmetric:
-            # the axis is inside the bodies
+            # facets on the axis are inside the bodies
             surfaces = np.setdiff1d(surfaces, locate_entities_boundary(mesh, facets, on_axis(mesh)))
     tag = as_tag(surfaces, mesh, (facets,), "surfaces")
     left = tag.entities
@@ -60,7 +60,7 @@ def touching_surface(config: Configuration, surfaces: Part | None, without: Sequ
 
 
 def with_border(skin: Skin, sets: Apart) -> Apart:
-    """Two sets of facets with those beside them, which have a node in common (collective)."""
+    """Two sets of facets, extended by adjacent facets with a common node (collective)."""
     config = skin.config
 
     def more(nodes: Bools) -> Bools:

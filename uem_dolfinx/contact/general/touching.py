@@ -19,9 +19,9 @@ class Touch(NamedTuple):
     """Two bodies that touch, or a body and a rigid surface.
 
     Attributes:
-        first: name of the one.
-        second: name of the other.
-        n_active: number of contactors that touch.
+        first: name of the first body.
+        second: name of the second body or rigid surface.
+        n_active: number of active contactors.
         force: on the first ``(gdim,)``.
     """
 
@@ -32,13 +32,13 @@ class Touch(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """What passes between two bodies, or a body and a rigid surface.
+    """Forces and heat between two bodies, or a body and a rigid surface.
 
     Attributes:
         touch: names, number of contactors and force.
-        moment: on the first.
-        normal: sum of the forces across the surfaces.
-        heat: power from the first to the second of one field, the heat of friction aside.
+        moment: moment on the first.
+        normal: sum of the normal forces.
+        heat: power from the first to the second in one field, without frictional heat.
     """
 
     touch: Touch
@@ -53,19 +53,19 @@ def sums_of_pairs(
     """Sums over the contactors of each pair of bodies, sorted by their numbers in the mesh's input (collective).
 
     Args:
-        parts: the contacts that a general contact consists of.
+        parts: the parts of a general contact.
         skin: surfaces of the bodies.
         names: of the bodies ``(n_bodies,)``.
         rigid: names of the rigid surfaces, of every part.
         centre: point that moments are taken about ``(gdim,)``.
-        field: whose power is summed up; None for no power.
+        field: field of the power; None for no power.
     """
     config, n = skin.config, skin.n_bodies + len(parts)
     g = config.gdim
     found: dict[tuple[int, int], Array] = {}
     for k, part in enumerate(parts):
         pair = part.pair
-        # rows of mortar have the contactors around their own in them, active or not
+        # mortar rows also contain neighbouring contactors, active or not
         active = pair.trial.active
         heat = sum((one.power() for one in pair.heats if one.law.field == field), np.zeros(len(active)))
         i = np.flatnonzero(active | pair.trial.force.any(axis=1) | (heat != 0))
@@ -81,7 +81,7 @@ def sums_of_pairs(
         np.add.at(sums, inverse.ravel(), rows)
         for key, row in (item for own in config.comm.allgather(list(zip(keys.tolist(), sums))) for item in own):
             a, b = divmod(key, n)
-            # nodes of either of two bodies may follow the other
+            # nodes of both bodies may be contactors
             a, b, sign = (a, b, 1.0) if a <= b else (b, a, -1.0)
             found[a, b] = found.get((a, b), 0.0) + row * np.where(np.arange(len(row)) < 2, 1.0, sign)
     called = [*names, *rigid]
@@ -92,10 +92,10 @@ def sums_of_pairs(
 def between(
     pairs: Sequence[Pair], names: Sequence[str], first: str, second: str | None, nothing: Resultant
 ) -> tuple[Resultant, float]:
-    """Force and moment on a body from another one, None for all of them, and the power that goes there.
+    """Force and moment on a body from another one, None for all others, and the power that flows there.
 
     Raises:
-        InputError: for a name that is not among all ``names``.
+        InputError: for an unknown name.
     """
     given.word("first", first, names)
     if second is not None:

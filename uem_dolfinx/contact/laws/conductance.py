@@ -1,4 +1,4 @@
-"""What conducts heat between surfaces in contact, as users declare it: so much power per area and difference of temperatures."""
+"""User input of thermal contact conductance: power per area and temperature difference."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ class Conductance(given.Sealed):
     """Heat through a contact: the power ``h (T - T_target)`` per area leaves the contactor and enters the target.
 
     Args:
-        h: conductance, a power per area and difference of temperatures. A number counts where surfaces touch, and open gaps conduct
-            nothing; infinity unites temperatures where surfaces touch. A function ``h(p, g)`` is given the contact pressures and gaps
-            of all contactors, ``(n,)`` each, both 0 or positive and one of them 0, and returns ``(n,)`` numbers.
+        h: conductance, a power per area and temperature difference. A number applies where surfaces touch, and open gaps conduct no
+            heat; infinity makes temperatures equal where surfaces touch. A function ``h(p, g)`` is called with the contact
+            pressures and gaps of all contactors, ``(n,)`` each, both 0 or positive and one of them 0, and returns ``(n,)`` numbers.
         field: number of the part of the mixed space that is the temperature, scalar Lagrange of the displacement's degree or less.
         temperature: of a rigid target, a number or a Constant; None for a meshed target, which has its own.
-        friction_share: part of the heat of friction that enters the contactor; the rest enters the target. None leaves this heat out.
-        dt: time that a step takes, a number or the Constant that the residual has, by which the work of friction in a step becomes a
-            power.
+        friction_share: part of the frictional heat that enters the contactor; the rest enters the target. None ignores frictional heat.
+        dt: duration of a step, a number or the Constant in the residual, to convert frictional work of a step to power.
 
     Raises:
         InputError, InputTypeError: for a value out of its range.
@@ -58,11 +57,11 @@ class Conductance(given.Sealed):
 
     @property
     def perfect(self) -> bool:
-        """Whether temperatures are the same where surfaces touch."""
+        """Whether temperatures are equal where surfaces touch."""
         return self.h == np.inf
 
     def without_temperature(self) -> Conductance:
-        """The same for a target that has a temperature of its own."""
+        """The same conductance for a target with its own temperature."""
         other = copy(self)
         other.temperature = None
         return other
@@ -73,10 +72,10 @@ class Conductance(given.Sealed):
         return dict(vars(self))
 
     def conductances(self, comm: MPI.Comm, name: str, p: Array, g: Array, closed: Bools) -> Array:
-        """At contactors ``(n,)`` with pressures and gaps ``(n,)`` each, of which some are ``closed`` (collective).
+        """Conductances at contactors ``(n,)`` with pressures p and gaps g ``(n,)``, of which some are ``closed`` (collective).
 
         Raises:
-            InputError, UserFunctionError: if the function raises, or returns anything else than so many numbers, 0 or positive.
+            InputError, UserFunctionError: if the function raises, or does not return n numbers, 0 or positive.
         """
         if not callable(self.h):
             return np.where(closed, self.h, 0.0)
@@ -90,11 +89,11 @@ class Conductance(given.Sealed):
 
 
 def conductances_of(heat: Any) -> tuple[Conductance, ...]:
-    """Conductances of a contact, handed as one, as a list, or as None for none.
+    """Conductances of a contact, given as one, as a list, or as None.
 
     Raises:
         InputTypeError: for anything else.
-        InputError: for two of one field that unite its temperatures, or that both take heat of friction.
+        InputError: for two of one field that both are infinite, or that both include frictional heat.
     """
     some = () if heat is None else (heat,) if hasattr(heat, "conductances") else heat
     fits = isinstance(some, list | tuple) and all(hasattr(one, "conductances") for one in some)
@@ -119,7 +118,7 @@ def one_of_fields(name: str, laws: Sequence[Conductance], field: Any) -> int:
 
 
 def value(number: float | fem.Constant) -> float:
-    """What a number or a Constant is now."""
+    """The present value of a number or a Constant."""
     return float(number.value) if isinstance(number, fem.Constant) else number
 
 

@@ -1,16 +1,14 @@
-"""Node to surface on contactors of degree 2: control gaps take the place of nodal gaps.
+"""Node to surface on contactors of degree 2, with control gaps instead of nodal gaps.
 
-A quadratic facet's shape functions are partly negative, so that under a pressure its
-nodal forces are zero or negative at vertices, and tell nothing about contact. In Bernstein's basis, which is positive, the same
-gap has the coefficients
+A quadratic facet's shape functions are partly negative, so that under a pressure its nodal forces are zero or negative at vertices,
+and are no criterion for contact. In the Bernstein basis, which is positive, the same gap has the coefficients
 
     g_v at a vertex,    2 g_m - (g_1 + g_2) / 2 in the middle of an edge,    and likewise in the middle of a quadrilateral,
 
-and its forces are integrals of the pressure with positive weights. So contact is decided by these control gaps and control
-forces: ``control gap >= 0, control force >= 0``, one of them zero. Where all nodes of a facet are active this unites the same
-nodes as nodal gaps do; at the rim it keeps active sets stable and pressures positive. The equations scale a contactor's own
-coefficient to one, so that its control gap is ``g_m - (g_1 + g_2) / 4``; the control forces are those of Bernstein's basis, and
-add up to the resultant.
+and its forces are integrals of the pressure with positive weights. The contact conditions are therefore ``control gap >= 0, control
+force >= 0``, one of them zero. If all nodes of a facet are active, the constraints are equivalent to nodal gaps; at the rim active
+sets are stable and pressures positive. The equations scale a contactor's own coefficient to one, so that its control gap is ``g_m -
+(g_1 + g_2) / 4``; control forces belong to the Bernstein basis, and their sum is the resultant.
 """
 
 from __future__ import annotations
@@ -37,18 +35,18 @@ STEEPEST = 0.2
 
 @dataclass(frozen=True)
 class Family:
-    """Which contactors in the middle of an edge or a facet depend on which vertices and middles around them.
+    """Dependence of contactors in the middle of edges and facets on vertices and edge middles around them.
 
     Every term subtracts ``weight`` times the gap of a parent, a vertex or an edge's middle, from the gap of a child, a contactor in
-    the middle of an edge or a facet. Parents may live on other ranks; children are always this rank's own.
+    the middle of an edge or a facet. Parents may belong to other ranks; children are owned by this rank.
 
     Attributes:
         config: configuration of the displacement, of degree 2.
         nodes: owned contactor nodes ``(n,)``.
-        child: place of the term's contactor ``(k,)``.
+        child: index of the term's contactor ``(k,)``.
         parent: local node of the term's parent ``(k,)``.
-        weight: ``(k,)``.
-        of_facet: whether the term leads from the middle of a facet to the middle of an edge ``(k,)``.
+        weight: weight of each term ``(k,)``.
+        of_facet: whether the child is the middle of a facet and the parent the middle of an edge ``(k,)``.
     """
 
     config: Configuration
@@ -59,11 +57,11 @@ class Family:
     of_facet: Bools
 
     def control_gaps(self, projection: Projection, usable: Bools) -> ControlGaps:
-        """Terms that count where the contactors are (collective).
+        """Terms that are valid for the current projection (collective).
 
         Args:
             projection: of the contactors.
-            usable: contactors over the target that no corner holds ``(n,)``; only their gaps count.
+            usable: contactors above the target and not held in a corner ``(n,)``; only their gaps count.
         """
         p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
         rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
@@ -79,11 +77,11 @@ class Family:
         return ControlGaps(self, ~alone[i], gap, normal, targets, weights)
 
     def sums(self, terms: Bools) -> Sums:
-        """At the parents of some of the terms ``(k,)``, of weight times child."""
+        """Matrix of sums of weight times child at the parents, for some of the terms ``(k,)``."""
         return Sums(self.config, self.nodes, self.child[terms], self.parent[terms], self.weight[terms])
 
     def basis(self, shared: Bools) -> Basis:
-        """Bernstein's, where gaps are quadratic in the terms ``shared (k,)``: its scale is over functions that scaled gaps belong to."""
+        """The Bernstein basis for terms ``shared (k,)`` with quadratic gaps; its scale is relative to the functions of scaled gaps."""
         scale = np.ones(len(self.nodes))
         scale[self.child[shared]] = 0.5
         scale[self.child[shared & self.of_facet]] = 0.25
@@ -95,8 +93,8 @@ class ControlGaps:
     """The terms of a family at one displacement.
 
     Attributes:
-        family: whose terms they are.
-        shared: whether the gap is quadratic from the child to all its parents ``(k,)``.
+        family: family of the terms.
+        shared: whether the gap is quadratic between the child and all its parents ``(k,)``.
         gap: of the parents ``(k,)``.
         normal: of the parents ``(k, gdim)``.
         targets: global nodes that the parents follow ``(k, nn)``.
@@ -122,7 +120,7 @@ class ControlGaps:
 
     @cached_property
     def basis(self) -> Basis:
-        """Functions that control forces are integrals with."""
+        """Basis of the control forces."""
         return self.family.basis(self.shared)
 
     def extend(self, equations: UnitingEquations) -> UnitingEquations:
@@ -140,7 +138,7 @@ class ControlGaps:
 
 
 class Bernstein(NodeToSurface):
-    """Implements ``Discretisation`` for contactors of degree 2; arguments as those of ``NodeToSurface``."""
+    """Implements ``Discretisation`` for contactors of degree 2; arguments as for ``NodeToSurface``."""
 
     #: A contactor in the middle of an edge or a facet follows contactors around it.
     chained = True
@@ -151,7 +149,7 @@ class Bernstein(NodeToSurface):
         self.family = Family(config, nodes, *_family(config, nodes))
 
     def spread(self, values: Array) -> Array:
-        """Integrals with Bernstein's basis (collective)."""
+        """Integrals with the Bernstein basis (collective)."""
         return self.family.basis(np.ones(len(self.family.child), bool)).of(values)
 
     def measured(self, kinematics: NodalKinematics, state: PairState) -> ControlKinematics:
@@ -168,13 +166,13 @@ class ControlKinematics(NodalKinematics):
     """``NodalKinematics`` with control gaps.
 
     Attributes:
-        control: the terms that lead to them.
+        control: terms of the control gaps.
     """
 
     control: ControlGaps = field(kw_only=True)
 
     def weights(self) -> tuple[Ints, Ints, Array]:
-        """Those of the feet, and what leads from the control gaps to the nodal ones."""
+        """Weights at the closest points, and of the terms of control gaps."""
         row, followed, weight = super().weights()
         c = self.control
         f, k = c.family, np.flatnonzero(c.shared)
@@ -187,7 +185,7 @@ class ControlKinematics(NodalKinematics):
 
     @property
     def force_per_multiplier(self) -> Array:
-        """Bernstein's basis functions over those that belong to the scaled gaps."""
+        """Bernstein basis functions over the functions of the scaled gaps."""
         return np.asarray(self.control.basis.scale)
 
     def _normal_rows(self, weights: Array) -> UnitingEquations:
@@ -197,17 +195,17 @@ class ControlKinematics(NodalKinematics):
         return self.control.forces(multipliers, state.active)
 
     def nodal_friction(self, tau: Array) -> Array:
-        """Handed on from the control points to the nodes; what targets get that are contactors themselves is not theirs (collective)."""
+        """Friction at the nodes from friction at the control points, without reactions on targets that are contactors (collective)."""
         sums = self.control.family.sums(self.control.shared)
         return np.column_stack([along - sums.of(along) for along in tau.T])
 
     def pressure_map(self, current: bool) -> PressureMap:
-        """Of control forces, integrals with Bernstein's basis."""
+        """Map of control forces, which are integrals with the Bernstein basis."""
         return PressureMap(self.cone * self.force_per_multiplier, self.control.basis)
 
 
 def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:
-    """Places of the children, local nodes of the parents, weights, and whether a term leads from facet to edge, ``(k,)`` each."""
+    """Indices of the children, local nodes of the parents, weights, and ``of_facet``, ``(k,)`` each."""
     place = np.full(config.n_local, -1, dtype=np.int64)
     place[nodes] = np.arange(len(nodes))
     layout = config.V.dofmap.dof_layout
@@ -226,7 +224,7 @@ def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, B
     children, parents_of, weights, of_facet = [], [], [], []
     for middle, parents, w, to_edge in relations:
         at = place[cells[:, middle]]
-        # a middle lies in several cells, all of which know its parents
+        # a middle node belongs to several cells with the same parents
         first, row = np.unique(at, return_index=True)
         row = row[first >= 0]
         children.append(np.repeat(at[row], len(parents)))

@@ -1,6 +1,6 @@
-"""Which facets contactors rest on where normals jump from facet to facet: changes across bends, corners entered and left.
+"""Change of facet by contactors on targets with discontinuous normals: crossing of edges, entering and leaving of corners.
 
-States are handed in and out; only the geometry of the target is kept.
+States are arguments and results; only the geometry of the target is stored.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MOST_CHANGES = 8
 
 
 def create_concave_edges(config: Configuration, target: Target, free: Bools) -> ConcaveEdges | None:
-    """What follows contactors from facet to facet; None where normals do not jump between facets."""
+    """Tracking of contactors from facet to facet; None for targets with continuous normals."""
     return ConcaveEdges(config, cast("MeshTarget", target), free) if target.faceted else None
 
 
@@ -41,7 +41,7 @@ class ConcaveEdges:
 
     Args:
         config: configuration of the displacement.
-        target: whose facets they are.
+        target: target of the contactors.
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
     """
 
@@ -49,11 +49,11 @@ class ConcaveEdges:
         self.config, self.target, self.free = config, target, free
         #: Coefficients of friction of the contactors ``(n,)``.
         self.mu: Array = np.zeros(len(free))
-        #: How far from the facets contactors are held ``(n,)``; None on them.
+        #: Distance from the facets at which contactors are held ``(n,)``; None without offset.
         self.offset: Array | None = None
 
     def place(self, nearest: Projection, points: Array, state: PairState) -> tuple[Projection, Corners | None]:
-        """Put contactors that a corner holds into it, and give those that change facets too often averaged normals (collective).
+        """Project contactors held in corners onto these; contactors that change facets too often get averaged normals (collective).
 
         Args:
             nearest: the contactors on their nearest facets.
@@ -61,7 +61,7 @@ class ConcaveEdges:
             state: of the pair.
 
         Returns:
-            The projection, and the corners that hold contactors, None if no rank has any.
+            The projection, and the corners that hold contactors; None if no rank has such a corner.
         """
         projection = with_averaged_normals(nearest, state.changes >= MOST_CHANGES, points)
         held = np.flatnonzero(state.in_corner)
@@ -75,7 +75,7 @@ class ConcaveEdges:
     def place_again(
         self, nearest: Projection, left: Bools, points: Array, state: PairState
     ) -> tuple[Projection, Projection, Corners | None]:
-        """Place contactors that have entered or left corners, their positions being the same (collective).
+        """Place contactors that have entered or left corners, at unchanged positions (collective).
 
         Args:
             nearest: the contactors on their nearest facets.
@@ -84,7 +84,7 @@ class ConcaveEdges:
             state: of the pair.
 
         Returns:
-            ``nearest``, and what ``place`` returns. A contactor that has just left is still as near to the facet that it left.
+            ``nearest``, and the results of ``place``. A contactor that has just left a corner is equally near to the facet that it left.
         """
         nearest = cast("FacetProjection", nearest)
         i = np.flatnonzero(left & ~state.in_corner)
@@ -97,14 +97,14 @@ class ConcaveEdges:
         return nearest, *self.place(nearest, points, state)
 
     def leave(self, corners: Corners | None, state: PairState) -> tuple[PairState, Bools]:
-        """Let go of the facet of a corner that would have to pull.
+        """Release facets of corners that are in tension.
 
         Args:
             corners: that hold contactors.
             state: of the pair.
 
         Returns:
-            The new state, and which contactors have let go ``(n,)``.
+            The new state, and contactors that have left a facet ``(n,)``.
         """
         left = np.zeros(len(self.free), dtype=bool)
         if corners is None or not len(corners.which):
@@ -123,7 +123,7 @@ class ConcaveEdges:
         return replace(state, facet=facet, held=held), left
 
     def follow(self, nearest: Projection, left: Bools, points: Array, state: PairState) -> tuple[PairState, bool]:
-        """Follow contactors onto new facets; into a concave corner they take the old facet with them (collective).
+        """Follow contactors onto new facets; in a concave corner they are held by the old facet, too (collective).
 
         Args:
             nearest: the contactors on their nearest facets.
@@ -141,7 +141,7 @@ class ConcaveEdges:
         facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
         settled = ~moved & ~left & ~state.in_corner
         facet[settled] = number[settled]
-        # first together with all facets that it is on, then with the first of them alone
+        # first together with all its present facets, then with the first of these only
         together = _moved_up(np.column_stack([state.held[i], number[i]]))[:, : held.shape[1]]
         full = (state.held[i] >= 0).all(axis=1)
         alone = np.full_like(together, -1)
@@ -161,7 +161,7 @@ class ConcaveEdges:
             entered |= bool(hold.any())
         switch = i[~taken]
         facet[switch], held[switch] = number[switch], -1
-        # one that is still led past the end of what holds it goes on with averaged normals
+        # a contactor that still moves past the end of its corner gets averaged normals
         past = ~known & state.active & (state.changes >= MOST_CHANGES) & (held >= 0).any(axis=1)
         facet[past], held[past] = number[past], -1
         return replace(state, facet=facet, held=held, changes=changes), entered or bool(past.any())
@@ -188,5 +188,5 @@ def with_averaged_normals(nearest: Projection, which: Bools, points: Array) -> F
 
 
 def _moved_up(facets: Ints) -> Ints:
-    """Rows with their facets first, then the empty places."""
+    """Rows sorted with facets first and empty entries (-1) last."""
     return np.take_along_axis(facets, np.argsort(facets < 0, axis=1, kind="stable"), axis=1)

@@ -1,7 +1,7 @@
-"""Contactors in the concave corners of a faceted target: held by two facets on an edge, by three in a vertex.
+"""Contactors in concave corners of a faceted target, held by two facets on an edge, or by three at a vertex.
 
-Facet normals jump from facet to facet; where two facets form a concave edge, a contactor
-drawn to it belongs to both, and would flip between them for ever if it had to choose.
+Facet normals are discontinuous. At a concave edge between two facets, a contactor is held by both; with one facet at a time it
+would alternate between them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from uem_dolfinx.parallel import reduced
 
 
 def find_corners(comm: MPI.Comm, target: MeshTarget, points: Array, which: Ints, facets: Ints) -> Corners | None:
-    """Corners that sets of facets form with each other; None if no rank asks for any (collective).
+    """Corners formed by sets of facets; None if there are no sets on any rank (collective).
 
     Args:
         comm: communicator.
-        target: whose facets they are.
+        target: target of these facets.
         points: positions of the contactors ``(k, gdim)``.
-        which: their places among the pair's contactors ``(k,)``.
-        facets: at least two for each, the rest -1 ``(k, gdim)``.
+        which: their indices among the pair's contactors ``(k,)``.
+        facets: at least two for each contactor, padded with -1 ``(k, gdim)``.
     """
     if not reduced(comm, len(which)):
         return None
@@ -68,10 +68,10 @@ class _Place:
 def _shared_place(
     target: MeshTarget, first: FacetProjection, points: Array, common: Bools, count: Ints, normals: Array
 ) -> _Place:
-    """Closest points on what the facets have in common: a side of the first for two facets, a vertex for three.
+    """Closest points on the common side of two facets, or on the common vertex of three.
 
-    A side that ends where the target does is continued for contactors that are past that end. Two facets that share only a vertex stand
-    for others beside them; their planes meet in a line.
+    A side is continued past the end of the target for contactors past that end. Two facets that share only a vertex approximate the
+    edge between neighbouring facets; their planes meet in a line.
     """
     k, nn = common.shape
     shape = target.shape
@@ -102,10 +102,10 @@ def _shared_place(
 
 
 def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Array) -> tuple[Array, Array]:
-    """Closest points on the line through a vertex in which the planes of two facets meet.
+    """Closest points on the intersection line of the planes of two facets with a common vertex.
 
     Returns:
-        Shape functions of the first facet, continued as far as need be, and their derivatives along the line ``(k, nn)``.
+        Shape functions of the first facet, extrapolated if necessary, and their derivatives along the line ``(k, nn)``.
     """
     along = cross_products(normals[:, 0], normals[:, 1])
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -120,9 +120,9 @@ def _on_line(target: MeshTarget, x: Array, points: Array, node: int, normals: Ar
 
 
 def _away(arms: Array, normals: Array, count: Ints) -> Array:
-    """Unit directions along facets with these normals away from the place they share, across an edge ``(k, gdim, gdim)``.
+    """Unit directions along facets with these normals, away from and across the common edge ``(k, gdim, gdim)``.
 
-    ``arms (k, gdim, gdim)`` lead from that place to the facets' middles.
+    ``arms (k, gdim, gdim)`` are vectors from the common edge or vertex to the facets' midpoints.
     """
     gdim = arms.shape[2]
     along = arms - np.einsum("krg,krg->kr", arms, normals)[:, :, None] * normals
@@ -137,10 +137,10 @@ def _away(arms: Array, normals: Array, count: Ints) -> Array:
 
 
 def _axes(normals: Array, count: Ints) -> Array:
-    """Orthonormal axes of the space that the normals span, their mean first ``(k, gdim, gdim)``."""
+    """Orthonormal axes of the span of the normals, their mean direction first ``(k, gdim, gdim)``."""
     k, gdim, _ = normals.shape
     spread = normals[:, 0] - normals[:, 1]
-    # two normals span a plane; whatever completes the axes is right for three
+    # two normals span a plane; for three normals any completion of the axes is valid
     basis = np.concatenate([normals.sum(axis=1)[:, None], spread[:, None], np.tile(np.eye(gdim), (k, 1, 1))], axis=1)
     axes = np.zeros((k, gdim, gdim))
     for r in range(gdim):

@@ -1,6 +1,6 @@
-"""Node to surface: each contactor node is united to the point of the target below it, the paper's coupling [UEM, 4.1-4.3].
+"""Node to surface: each contactor node is constrained to the point of the target below it, the paper's coupling [UEM, 4.1-4.3].
 
-Targets may be meshed or rigid. Where the normals of a meshed target jump from facet to facet, ``concave_edges`` says which facets hold a
+Targets may be meshed or rigid. For meshed targets with discontinuous normals, ``concave_edges`` determines the facets of a
 contactor.
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class NodeToSurface(OnTarget):
-    """Implements ``Discretisation``: contactor nodes against the surface of one target; arguments as those of ``OnTarget``.
+    """Implements ``Discretisation``: contactor nodes against the surface of one target; arguments as for ``OnTarget``.
 
     Args:
         chords: trial rows with the weights of the straight pieces between a curved target's nodes [UEM, 4.5].
@@ -41,7 +41,7 @@ class NodeToSurface(OnTarget):
 
     chained, two_pass = False, True
     pointwise = at_feet = True
-    #: Whether an end of the target holds contactors that came to it there, one or each ``(n,)``.
+    #: Whether an end of the target holds contactors that first touch there, for all or for each ``(n,)``.
     ends_hold: bool | Bools = True
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
@@ -54,26 +54,26 @@ class NodeToSurface(OnTarget):
 
     @classmethod
     def like(cls, other: OnTarget) -> NodeToSurface:
-        """The same contactors and target with nodal gaps, for methods that push nodes."""
+        """The same contactors and target with nodal gaps, for methods with nodal contact forces."""
         how: dict[str, Any] = {"sliding": other.sliding, "thickness": other.thickness}
         return cls(other.config, other.nodes, other.target, free=other.free_of_owned, **how)
 
     def hold(self, free: Bools) -> None:
-        """Take which components have no Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
+        """Set components without Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
         super().hold(free)
-        #: Nodes that contactors followed last ``(n, nt)``, and which of their components may move ``(n, nt, gdim)``.
+        #: Followed nodes of the last call ``(n, nt)``, and their free components ``(n, nt, gdim)``.
         self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
         if self.concave_edges is not None:
             self.concave_edges.free = self.free
 
     def set_offset(self, offset: Array | None) -> None:
-        """Take other offsets ``(n,)``, at corners too; contactors are to be placed again."""
+        """Set offsets ``(n,)``, also at corners; contactors must be placed again."""
         super().set_offset(offset)
         if self.concave_edges is not None:
             self.concave_edges.offset = offset
 
     def with_friction(self, mu: Array) -> None:
-        """Take the slopes of the cones ``(n,)``, with which contactors leave corners."""
+        """Set the slopes of the cones ``(n,)``, also for contactors that leave corners."""
         super().with_friction(mu)
         if self.concave_edges is not None:
             self.concave_edges.mu = mu
@@ -97,25 +97,25 @@ class NodeToSurface(OnTarget):
         return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves), state)
 
     def _asks(self, state: PairState) -> bool:
-        """Whether any contactor on any rank is in question (collective)."""
+        """Whether any contactor on any rank may be near the target (collective)."""
         return not self.far
 
     def nowhere(self, points: Array) -> NodalKinematics:
-        """Contactors at ``points (n, gdim)`` of which none on any rank is in question, at no price."""
+        """Kinematics of contactors at ``points (n, gdim)`` that are far from the target on all ranks, without a search."""
         p = self.target.nowhere(points) if isinstance(self.target, MeshTarget) else self.target.project(points)
         return NodalKinematics(self, points, p, p, p.gap, None, None)
 
     def measured(self, kinematics: NodalKinematics, state: PairState) -> NodalKinematics:
-        """The kinematics with the gaps that decide on contact (collective)."""
+        """The kinematics with deciding gaps (collective)."""
         return kinematics
 
     def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
-        """Move the feet of contactors that the target's end holds out to where they are: force and reaction stay on one line."""
+        """Continue closest points of contactors held by an end to below these, so that force and reaction are collinear."""
         i = np.flatnonzero(state.active & state.at_end & (nearest.beyond != 0).any(axis=1))
         return self.target.continued(nearest, i) if len(i) else nearest
 
     def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:
-        """Put the feet of contactors that friction holds where they stick, so that no bend leads them astray (collective)."""
+        """Set the closest points of sticking contactors to their anchors, so that edges between facets have no effect (collective)."""
         f = state.friction
         if f is None or not isinstance(self.target, MeshTarget) or not isinstance(nearest, FacetProjection):
             return nearest
@@ -124,7 +124,7 @@ class NodeToSurface(OnTarget):
         return nearest.with_those(i, replace(own, beyond=np.zeros_like(own.beyond)))
 
     def _target_moves(self, p: Projection) -> Bools | None:
-        """Which targets can move along the normal (collective)."""
+        """Whether the target can move along the normal, per contactor (collective)."""
         if not p.nodes.shape[1]:
             return None
         nodes = np.maximum(p.nodes, 0)
@@ -140,9 +140,9 @@ class NodalKinematics(PlacedOnTarget):
     """Implements ``Kinematics``: nodes on the surface of one target.
 
     Attributes:
-        corners: of the target that hold contactors; None if no rank has any.
-        target_moves: whether the target can move along the normal ``(n,)``; None where no contactor is prescribed.
-        left: contactors that have just left a corner ``(n,)``; None if none has.
+        corners: of the target that hold contactors; None if no rank has such a corner.
+        target_moves: whether the target can move along the normal ``(n,)``; None if no contactor is prescribed.
+        left: contactors that have just left a corner ``(n,)``, or None.
     """
 
     of: NodeToSurface
@@ -158,24 +158,24 @@ class NodalKinematics(PlacedOnTarget):
 
     @cached_property
     def ties(self) -> Ties:
-        """With the shape functions at the feet; see ``Kinematics``."""
+        """Weights are the shape functions at the closest points; see ``Kinematics``."""
         of = self.of
         return Ties.of(of.config, of.nodes, self.weights(), of.free_of_owned if of.prescribed else None, of.at_feet)
 
     def weights(self) -> tuple[Ints, Ints, Array]:
-        """Places of contactors, global nodes that they follow and weights, ``(k,)`` each."""
+        """Indices of contactors, followed global nodes and weights, ``(k,)`` each."""
         p = self.projection
         row, a = np.nonzero(p.nodes >= 0)
         return row.astype(np.int64), p.nodes[row, a], p.weights[row, a]
 
     @property
     def force_per_multiplier(self) -> Array:
-        """The whole multiplier ``(n,)``."""
+        """One, since multipliers are forces ``(n,)``."""
         return np.ones(len(self.points))
 
     @cached_property
     def cone(self) -> Array:
-        """What facets push with, over their force along the contactor's normal: more on an edge ``(n,)`` (first time: collective)."""
+        """Sum of facet forces over the force along the contactor's normal, above 1 on an edge ``(n,)`` (first time: collective)."""
         cone, target, p = np.ones(len(self.points)), self.of.target, self.projection
         if self.of.frictional and target.faceted and isinstance(target, MeshTarget) and isinstance(p, FacetProjection):
             averaged = (p.facet >= 0) & (p.averaged == p.normal).all(axis=1)
@@ -188,7 +188,7 @@ class NodalKinematics(PlacedOnTarget):
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
     def placed_again(self, state: PairState) -> NodalKinematics:
-        """Put contactors that have entered or left a corner where they now belong (collective)."""
+        """Place contactors that have entered or left a corner (collective)."""
         if self.of.concave_edges is None:
             return self
         left = np.zeros(len(self.points), dtype=bool) if self.left is None else self.left
@@ -197,7 +197,7 @@ class NodalKinematics(PlacedOnTarget):
         return self.of.measured(there, state)
 
     def follow(self, state: PairState) -> tuple[NodalKinematics, PairState, bool]:
-        """Follow contactors across bends, into corners and out of them (collective)."""
+        """Follow contactors across edges, into and out of corners (collective)."""
         if self.of.concave_edges is None:
             return self, state, False
         state, left = self.of.concave_edges.leave(self.corners, state)
@@ -208,14 +208,14 @@ class NodalKinematics(PlacedOnTarget):
 
     @cached_property
     def ends(self) -> Ends:
-        """Which can hold contactors; see ``Kinematics``."""
+        """Open ends, which can hold contactors; see ``Kinematics``."""
         return Ends(self.projection, self.of.thickness, self.of.ends_hold)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
     @cached_property
     def gap_rows(self) -> GapRows:
-        """One row along the normal for each contactor, then one along each further axis of a corner that holds it."""
+        """One row along the normal for each contactor, followed by rows along further axes of corners."""
         p, c, of = self.projection, self.corners, self.of
         found = GapRows.along_normals(of.config, self._normal_rows(p.weights), np.ones(len(self.points)), of.free)
         if of.chords:
@@ -241,12 +241,12 @@ class NodalKinematics(PlacedOnTarget):
         return GapRows(of.config, equations, found.scale, of.free, np.concatenate(contactors), np.concatenate(kinds), moved)
 
     def _normal_rows(self, weights: Array) -> UnitingEquations:
-        """Equations of all contactors along the normals, with these weights of the target's nodes ``(n, nn)``."""
+        """Normal equations of all contactors, with these weights of the target's nodes ``(n, nn)``."""
         p, none = self.projection, np.zeros(len(self.points), bool)
         return UnitingEquations.along(self.of.nodes, p.normal, p.nodes, weights, self.gap, none)
 
     def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
-        """Contact forces along the normals, of all facets of a corner together (collective)."""
+        """Normal contact forces, summed over the facets of a corner (collective)."""
         lam = np.zeros(len(self.points))
         normal = equations.kind == NORMAL
         lam[equations.contactor[normal]] = multipliers[normal]
@@ -261,22 +261,22 @@ class NodalKinematics(PlacedOnTarget):
         return Traction(lam, nodal, force)
 
     def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
-        """Deciding and nodal forces along the normals from the multipliers of all contactors, each ``(n,)`` (collective)."""
+        """Deciding and nodal normal forces from the multipliers of all contactors, each ``(n,)`` (collective)."""
         return multipliers, multipliers
 
     def nodal_friction(self, tau: Array) -> Array:
-        """Each its own."""
+        """Nodal friction equals the multipliers."""
         return tau
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
-        """On each contactor its force, on the target's nodes the opposite with the weights of the foot."""
+        """The force on each contactor, and the opposite force on the target's nodes with the weights of the closest point."""
         p, i, config = self.projection, np.flatnonzero((state.force != 0).any(axis=1)), self.of.config
         nodes = np.concatenate([config.to_global(self.of.nodes[i])[:, None], p.nodes[i]], axis=1)
         share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
         return nodes.ravel(), (share[..., None] * state.force[i, None, :]).reshape(-1, config.gdim)
 
     def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """Second derivatives of the gaps of contactors that push; those in a corner keep to its edge."""
+        """Second derivatives of the gaps of contactors with force; contactors in corners remain on the edge."""
         p, c, nodes = self.projection, self.corners, self.of.nodes
         i = np.flatnonzero(((state.lam > 0) | ~state.active) & (state.nodal != 0) & ~state.in_corner)
         own, followed, blocks = nodes[i], p.nodes[i], -state.nodal[i, None, None] * p.hessians(i)
@@ -287,20 +287,20 @@ class NodalKinematics(PlacedOnTarget):
         return [(np.column_stack([self.of.config.to_global(own), followed]), blocks)]
 
     def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
-        """Derivatives of the rows along forces of friction, of contactors that no corner holds."""
+        """Derivatives of the rows along friction forces, without contactors held in corners."""
         plain = ~state.in_corner[which]
         i, p = which[plain], self.projection
         return [(np.column_stack([self.of.config.to_global(self.of.nodes[i]), p.nodes[i]]), p.turnings(i, tau[plain]))]
 
     def pressure_map(self, current: bool) -> PressureMap:
-        """Of nodal forces, each the integral of the pressure over the node's shape function."""
+        """Map of nodal forces, which are integrals of the pressure times the node's shape function."""
         return PressureMap(self.cone)
 
     def heights(self) -> Array:
-        """Of the nodes."""
+        """Heights of the nodes."""
         return self.projection.height
 
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
-        """At the nodes themselves, and at their feet."""
+        """Values at the nodes, and at their closest points."""
         n = len(self.points)
         return (np.arange(n), self.of.config.to_global(self.of.nodes), np.ones(n)), NodalKinematics.weights(self)

@@ -1,6 +1,6 @@
-"""Many contacts as one interface: what is placed, decided and solved is asked once for all of them.
+"""Many contacts as one interface, with joint placement, active set and equations.
 
-What users see of one of the contacts is its ``Member``.
+Users access each of the contacts through its ``Member``.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class JoinedInterface(Interface):
     """Several contacts as one interface (collective).
 
     Args:
-        own: interfaces of the contacts, which are alike but for surfaces, friction's values, offsets and bounds on overlaps.
+        own: interfaces of the contacts, equal except for surfaces, friction values, offsets and penetration bounds.
 
     Attributes:
-        own: likewise.
-        members: what they are seen as.
+        own: as above.
+        members: access to each of the contacts.
         label: number of the contact of each contactor ``(n,)``.
     """
 
@@ -60,11 +60,11 @@ class JoinedInterface(Interface):
 
     @property
     def members(self) -> Sequence[Interface]:
-        """Its contacts."""
+        """Members of the contacts."""
         return [one for member in self._members if (one := member()) is not None]
 
     def make_members(self) -> list[Member]:
-        """What the contacts are seen as; who asks keeps them, and they keep this."""
+        """Make the members; the caller keeps references to them, and they keep this interface."""
         members = [Member(self, k, pair) for k, pair in enumerate(self.own)]
         self._members = list(map(weakref.ref, members))
         return members
@@ -75,7 +75,7 @@ class JoinedInterface(Interface):
         return self.discretisation.label
 
     def turns(self) -> Sequence[Any]:
-        """Of active contactors first those of the first contact of each node, then of the second (collective)."""
+        """Groups of active contactors: first of the first contact of each node, then of the second (collective)."""
         i = np.flatnonzero(self.trial.active)
         i = i[np.argsort(self.nodes[i], kind="stable")]
         turn = np.arange(len(i)) - np.searchsorted(self.nodes[i], self.nodes[i])
@@ -86,7 +86,7 @@ class JoinedInterface(Interface):
         return self.own[self.label[i]].name
 
     def state_of(self, k: int, state: PairState) -> PairState:
-        """A contact's part of a state, with facets as its target alone numbers them."""
+        """A contact's part of a state, with its own numbers of facets."""
         facets, surface = self.discretisation.target.facets, self.discretisation.surface_of[k]
         return renumbered(rows(state, self.rows_of[k]), lambda facet: facets.alone(facet, surface))
 
@@ -97,7 +97,7 @@ class JoinedInterface(Interface):
 
     @property
     def far_of(self) -> Bools:
-        """Which contacts are not looked at ``(n_contacts,)``."""
+        """Contacts that are skipped ``(n_contacts,)``."""
         return self.discretisation.far_of
 
     @far_of.setter
@@ -105,19 +105,19 @@ class JoinedInterface(Interface):
         self.discretisation.look_at(far)
 
     def commit(self) -> None:
-        """Make the trial state the committed one, but of contacts that are not looked at; to be followed by ``project``."""
+        """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""
         before, far = self.committed, self.discretisation.far_of[self.label]
         super().commit()
         if far.any():
             self.trial = self.committed = with_rows(self.committed, far, rows(before, far))
 
     def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
-        """Go on from what ``memory`` returned, to be followed by ``project`` where bodies and target were then."""
+        """Restore a state from ``memory``; call ``project`` afterwards, with bodies and target at their positions of that time."""
         self.discretisation.far = False
         super().remember(memory)
 
     def part(self) -> list[Interface]:
-        """The contacts with interfaces of their own again, in their committed states; to be followed by ``project`` (collective)."""
+        """The separate interfaces of the contacts, in their committed states; call ``project`` afterwards (collective)."""
         for k, (pair, member) in enumerate(zip(self.own, self.members)):
             if pair.friction is not None:
                 pair.friction.free = self.discretisation.free[self.rows_of[k]]
@@ -127,6 +127,6 @@ class JoinedInterface(Interface):
         return self.own
 
     def memory_of(self, k: int, memory: tuple[PairState, Bools, Bools]) -> tuple[PairState, Bools, Bools]:
-        """A contact's part of what ``memory`` returned."""
+        """A contact's part of the result of ``memory``."""
         reserved, redundant = (a[self.rows_of[k]] for a in memory[1:])
         return self.state_of(k, memory[0]), reserved, redundant

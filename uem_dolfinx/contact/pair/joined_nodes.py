@@ -1,6 +1,6 @@
-"""Contactors of many contacts, one contact after the other, each against its own target, and their friction.
+"""Contactors of many contacts, one contact after the other, each with its own target, and their friction.
 
-A node of several contacts stands here several times.
+A node of several contacts occurs several times.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class JoinedNodes(NodeToSurface):
     """Implements ``Discretisation``: contactors of several contacts (collective).
 
     Args:
-        own: what ties the contactors of each contact to its target.
+        own: discretisations of the contacts.
 
     Attributes:
         label: number of the contact of each contactor ``(n,)``.
-        far_of: which contacts are not looked at ``(n_contacts,)``.
+        far_of: contacts that are skipped ``(n_contacts,)``.
     """
 
     target: JoinedTarget
@@ -54,14 +54,14 @@ class JoinedNodes(NodeToSurface):
             self.set_offset(np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
 
     def hold(self, free: Bools) -> None:
-        """Take which components have no Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
+        """Set components without Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
         super().hold(free)
         for one in getattr(self, "_own", ()):
             one.hold(free)
 
     @property
     def far(self) -> bool:  # type: ignore[override]
-        """Whether no contact is looked at."""
+        """Whether all contacts are skipped."""
         return bool(self.far_of.all())
 
     @far.setter
@@ -69,29 +69,29 @@ class JoinedNodes(NodeToSurface):
         self.look_at(np.full(len(self.far_of), far))
 
     def look_at(self, far: Bools) -> None:
-        """Take which contacts are not looked at from now on ``(n_contacts,)``."""
+        """Set which contacts are skipped from now on ``(n_contacts,)``."""
         self.far_of, self._projected = far, None
         if hasattr(self, "target"):
             self.target.asked = ~far[self.label]
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
-        """See ``OnTarget``, of contacts that have offsets alone."""
+        """See ``OnTarget``; only for contacts with offsets."""
         i = np.flatnonzero(np.array([one.offset is not None for one in self._own])[self.label])
         assert self.offset is not None
         return found.with_those(i, found.take(i).across_edges(points[i], self.offset[i]))
 
     def look_farther(self) -> bool:
-        """Look at contacts that are far apart, from the next placement on: whether any were."""
+        """Include separated contacts from the next placement on; return whether there were any."""
         was = bool(self.far_of.any())
         self.far = False
         return was
 
     def commit(self) -> None:
-        """Contacts that are far apart stay so."""
+        """Accept a step; separated contacts remain skipped."""
 
 
 class JoinedLaw:
-    """A law of friction of each of several contacts, all of one kind, as of ``FrictionLaw``.
+    """Friction laws of several contacts, all of one kind, as one ``FrictionLaw``.
 
     Args:
         laws: of the contacts.
@@ -106,7 +106,7 @@ class JoinedLaw:
         self._kind = np.array([list(kinds).index(repr(parameters(law)[1:])) for law in laws])[label]
 
     def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
-        """Of each contactor by the law of its contact."""
+        """Limit of each contactor by the law of its contact."""
         if len(self._kinds) == 1:
             return self._kinds[0].limit(value, lam, area)
         found = np.zeros((2, len(value)))
@@ -147,20 +147,20 @@ class JoinedSliding(Sliding):
 
 
 class Fronts:
-    """Where contactors of several contacts begin to slip; arguments as of ``Front`` and ``JoinedNodes``."""
+    """Slip fronts of several contacts; arguments as for ``Front`` and ``JoinedNodes``."""
 
     def __init__(self, label: Ints, comm: MPI.Comm):
         self._comm, self._label = comm, label
         self._fronts: dict[int, Front] = {}
 
     def along(self, begin: Bools, back: Bools, force: Array, points: Array) -> tuple[Bools, Array]:
-        """Which contactors go along ``(n,)``, of the same contact alone, and forces they take over ``(n, gdim)`` (collective).
+        """Contactors of the same contact that slip in advance ``(n,)``, and their forces ``(n, gdim)`` (collective).
 
         Args:
             begin: contactors that begin to slip ``(n,)``.
-            back: contactors that went along last and have been held again ``(n,)``.
-            force: along the target ``(n, gdim)``.
-            points: where contactors are ``(n, gdim)``.
+            back: contactors that slipped in advance and stick again ``(n,)``.
+            force: tangential forces ``(n, gdim)``.
+            points: positions of contactors ``(n, gdim)``.
         """
         n = int(reduced(self._comm, int(self._label.max(initial=-1)), op=MPI.MAX)) + 1
         some = reduced(self._comm, np.bincount(self._label[begin], minlength=n))

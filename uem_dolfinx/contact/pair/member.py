@@ -19,7 +19,7 @@ from uem_dolfinx.geometry.projection import FacetProjection
 
 
 def _rows_of(name: str) -> Any:
-    """A member's rows of an array of the whole, to be asked for and to be set."""
+    """Property for a member's rows of an array of the joint interface."""
 
     def get(member: Member) -> Any:
         return getattr(member.joined, name)[member._rows]
@@ -31,12 +31,12 @@ def _rows_of(name: str) -> Any:
 
 
 class Member(Interface):
-    """A part of a ``JoinedInterface`` as an interface of its own: states are the whole's rows, facets are numbered as by its target alone.
+    """One contact of a ``JoinedInterface`` as a separate interface, with its rows of states and its own numbers of facets.
 
     Args:
-        whole: the ``JoinedInterface`` that it is a part of.
+        whole: the ``JoinedInterface``.
         k: number of the contact.
-        own: its interface as it was made, with its own target.
+        own: its original interface, with its own target.
     """
 
     def __init__(self, whole: Any, k: int, own: Interface):
@@ -48,7 +48,7 @@ class Member(Interface):
 
     @property
     def whole(self) -> Interface:
-        """What it is a part of."""
+        """The joint interface."""
         return self.joined
 
     # -- states ----------------------------------------------------------------------------------------------------------
@@ -76,7 +76,7 @@ class Member(Interface):
         every[self._rows] = value
         setattr(self.joined, name, every)
 
-    #: As of ``Interface``, each its rows of the whole's ``(n,)``.
+    #: See ``Interface``; rows of the joint arrays ``(n,)``.
     reserved = _rows_of("reserved")
     redundant = _rows_of("redundant")
     _reserved = _rows_of("_reserved")
@@ -84,7 +84,7 @@ class Member(Interface):
 
     @property
     def mutual(self) -> bool:  # type: ignore[override]
-        """Whether contactor and target follow each other, of this contact."""
+        """Whether contactor and target of this contact follow each other."""
         return bool(self.joined.mutual_of[self._k])
 
     @mutual.setter
@@ -98,7 +98,7 @@ class Member(Interface):
         return self.joined.trial.active[self._rows]
 
     def largest_gap_here(self) -> float:
-        """Largest gap of an active contactor of this rank, or distance from where it is to stick, a length."""
+        """Largest gap of an active contactor of this rank, or distance from its anchor, a length."""
         whole = self.joined
         here = float(np.abs(self.gap[self.united & ~self.redundant]).max(initial=0.0))
         if whole.friction is None:
@@ -113,7 +113,7 @@ class Member(Interface):
 
     @property
     def far(self) -> bool:
-        """Whether it is not looked at."""
+        """Whether it is skipped, since the surfaces are separated."""
         return bool(self.joined.discretisation.far_of[self._k])
 
     @far.setter
@@ -124,12 +124,12 @@ class Member(Interface):
 
     @property
     def asked(self) -> bool:
-        """Whether any contactor of this contact, on any rank, is in question."""
+        """Whether any contactor of this contact, on any rank, was near the target in the last placement."""
         return self.joined.asked and not self.far
 
     @property
     def kinematics(self) -> Kinematics:  # type: ignore[override]
-        """Of its contactors; made when it is first asked for."""
+        """Kinematics of its contactors, made at the first access."""
         whole: Any = self.joined.kinematics
         if self._known is None or self._known[0] is not whole:
             self._known = whole, self.joined.trial, self._kinematics_of(whole)
@@ -162,12 +162,12 @@ class Member(Interface):
     # -- what is set between steps ---------------------------------------------------------------------------------------
 
     def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
-        """Go on from a memory, to be followed by ``project`` where bodies and target were then."""
+        """Restore a state from ``memory``; call ``project`` afterwards, with bodies and target at their positions of that time."""
         self.far = False
         super().remember(memory)
 
     def set_offset(self, offset: Array | None) -> None:
-        """Take other offsets ``(n,)``; contactors are to be placed again (collective)."""
+        """Set offsets ``(n,)``; contactors must be placed again (collective)."""
         self.discretisation.set_offset(offset)
         nodal = self.joined.discretisation
         every = np.zeros(len(nodal.nodes)) if nodal.offset is None else nodal.offset.copy()
@@ -176,13 +176,13 @@ class Member(Interface):
         nodal.set_offset(every if others else None)
 
     def know_friction(self, law: FrictionLaw, value: Array) -> None:
-        """Take a law of friction, and values of its parameter ``(n,)``, with which the committed state has been reached (collective)."""
+        """Set the friction law and parameter values ``(n,)`` of the committed state (collective)."""
         assert self.friction is not None and self.joined.friction is not None
         self.friction.set(law, value)
         self.joined.friction.set(*self._friction_of_all())
 
     def set_friction(self, law: FrictionLaw, value: Array) -> None:
-        """Take a law of friction, and other values of its parameter ``(n,)``, between two steps (collective)."""
+        """Set a friction law and values of its parameter ``(n,)``, between two steps (collective)."""
         assert self.friction is not None
         self.friction.set(law, value)
         self.joined.set_friction(*self._friction_of_all())

@@ -28,12 +28,12 @@ def each(change: Callable[..., Any], *states: PairState) -> PairState:
 
 
 def rows(state: PairState, which: Any) -> PairState:
-    """Some contactors of a state, by a slice or numbers ``(k,)``."""
+    """The state of some contactors, by a slice or numbers ``(k,)``."""
     return each(lambda _, a: a[which], state)
 
 
 def with_rows(state: PairState, which: Any, other: PairState) -> PairState:
-    """The state with some contactors, by a slice, numbers or a mask, as in another state of these alone."""
+    """The state with some contactors, by a slice, numbers or a mask, replaced by another state of these."""
 
     def changed(_: str, a: Any, b: Any) -> Any:
         a = a.copy()
@@ -44,10 +44,10 @@ def with_rows(state: PairState, which: Any, other: PairState) -> PairState:
 
 
 def joined(states: Sequence[PairState]) -> PairState:
-    """The state of the contactors of several, one after the other."""
+    """The concatenation of several states."""
     return each(lambda _, *a: np.concatenate(a), *states)
 
 
 def renumbered(state: PairState, number: Callable[[Any], Any]) -> PairState:
-    """The state with facets numbered otherwise, which ``number (...)`` tells."""
+    """The state with facets renumbered by ``number (...)``."""
     return each(lambda name, a: number(a) if name in FACETS else a, state)

@@ -1,4 +1,4 @@
-"""What contactors and what they face have of a field: means over both sides of a contact, where contactors have been placed."""
+"""Means of a field over both sides of a contact, for the current placement."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uem_dolfinx.geometry.projection import Projection
 
 
 class Placed(Protocol):
-    """What is asked of an interface."""
+    """Members of an interface that are needed here."""
 
     config: Configuration
     kinematics: Kinematics
@@ -30,11 +30,11 @@ class Sides:
     """Both sides of contactors at one placement.
 
     Attributes:
-        projection: of the contactors there.
-        halo: of the nodes that count.
-        node: global numbers of these, of each term ``(k,)``.
-        row: place of the contactor of each term ``(k,)``.
-        own: weights of the contactor's mean, zero in those of the target ``(k,)``.
+        projection: of the contactors.
+        halo: of the nodes in all terms.
+        node: global node of each term ``(k,)``.
+        row: index of the contactor of each term ``(k,)``.
+        own: weights of the contactor's mean, zero in terms of the target ``(k,)``.
         theirs: weights of the target's mean ``(k,)``.
     """
 
@@ -46,20 +46,20 @@ class Sides:
     theirs: Array
 
     def sum(self, terms: Array) -> Array:
-        """Of each contactor's terms ``(k,)``: ``(n,)``."""
+        """Sum of each contactor's terms ``(k,)``: ``(n,)``."""
         return np.asarray(np.bincount(self.row, terms, minlength=len(self.projection.gap)), dtype=float)
 
     def means(self, weights: Array, nodal: Array) -> Array:
-        """Of values at owned nodes ``(n_owned,)``, with the terms' weights ``(n,)`` (collective)."""
+        """Means of values at owned nodes ``(n_owned,)``, with the terms' weights: ``(n,)`` (collective)."""
         return self.sum(weights * self.halo.take(nodal[:, None].__getitem__)[:, 0])
 
     def hand_on(self, weights: Array, amounts: Array) -> Array:
-        """The transpose of ``means``: amounts of contactors ``(n,)`` at owned nodes ``(n_owned,)`` (collective)."""
+        """Transpose of ``means``: distribute amounts of contactors ``(n,)`` to owned nodes ``(n_owned,)`` (collective)."""
         return np.asarray(self.halo.add((weights * amounts[self.row])[:, None])[:, 0])
 
 
 def sides_of(pair: Placed) -> Sides:
-    """Both sides of contactors where they have been placed (collective)."""
+    """Both sides of contactors in their current placement (collective)."""
     k = pair.kinematics
     (row, node, weight), (their_row, their_node, their_weight) = k.means()
     none, others, every = np.zeros(len(row)), np.zeros(len(their_row)), np.concatenate([node, their_node])
@@ -74,15 +74,15 @@ def sides_of(pair: Placed) -> Sides:
 
 
 def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: str, pair: Any, heats: Any) -> Array:
-    """Mean of the temperatures of contactors and of what they face ``(n,)`` (collective).
+    """Mean of the temperatures of contactors and of the opposite surface ``(n,)`` (collective).
 
     Args:
         config: of a displacement among other fields.
         nodes: contactors ``(n,)``.
         field: number of the part that is the temperature.
         name: of the contact.
-        pair: interface; until its contactors have been placed, or for None, their own temperatures count.
-        heats: conductances, of which one of the field may tell a rigid target's temperature.
+        pair: interface; before the first placement, or for None, only the contactors' temperatures count.
+        heats: conductances; one of this field may contain a rigid target's temperature.
 
     Raises:
         InputError, SpaceError: if there is no such temperature.
@@ -98,7 +98,7 @@ def mean_temperatures(config: Configuration, nodes: Indices, field: int, name: s
         return np.asarray(T[nodes])
     at = sides_of(pair)
     both = at.own + at.theirs
-    # nothing is opposite to rigid surfaces' contactors, and to those of many bodies that are near none
+    # contactors on rigid surfaces, and without a body nearby, have no opposite nodes
     mean = at.means(both, T) / at.sum(both)
     known = [value(one.temperature) for one in heats if one.field == field and one.temperature is not None]
     return np.asarray(0.5 * (mean + known[0]) if known else mean)

@@ -1,17 +1,17 @@
-"""The tie of a preloaded section: two facing surfaces that are tied but for an opening along an axis, which all tied rows share.
+"""The tie of a preloaded section: two facing surfaces, tied except for a common opening along an axis.
 
-With the tied rows r, which vanish where nothing opens, the axis a and the opening d,
+With the tied rows r, which vanish without an opening, the axis a and the opening d,
 
     r_ic = s_ic a_c d    for every contactor i and component c,
 
-where s are the shares of ``TiedRows``. While the section carries a given force, d is unknown: one row, the leading one 0, tells it, and
-the others follow,
+where s are the shares of ``TiedRows``. While the section has a given force, d is unknown: it is determined by one leading row 0, on
+which the others depend,
 
     r_ic - (s_ic a_c / s_0 a_0) r_0 = 0,    d = r_0 / (s_0 a_0),
 
-so that the motion that opens the section is what the leading row leaves free. The force F, positive in tension, acts on it by the pair of
-forces whose virtual work is -F times that of d: as a multiplier -F / (s_0 a_0) of the leading row. Once locked, d is a number and all
-rows hold. In both cases the multipliers are forces of the tie, and ``-sum lam_ic s_ic a_c`` is the force that the section carries.
+so that the leading row leaves the opening free. The force F, positive in tension, acts as a pair of forces with the virtual work -F
+times the variation of d, which is a multiplier -F / (s_0 a_0) of the leading row. Once locked, d is constant and all rows are
+active. In both cases the multipliers are forces of the tie, and ``-sum lam_ic s_ic a_c`` is the force in the section.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from uem_dolfinx.parallel import agree, gathered, reduced
 
 
 class Preloaded(Tie):
-    """A section that opens along an axis, tied in all else; other arguments as those of ``Tie``.
+    """A section that opens along an axis and is otherwise tied; other arguments as for ``Tie``.
 
     Args:
-        axis: direction of length one ``(gdim,)``; None is the mean normal of the target.
+        axis: unit vector ``(gdim,)``; None is the mean normal of the target.
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.
 
     Attributes:
-        axis: the direction that points out of the target ``(gdim,)``, known once the section has been tied.
-        force: that the section carries while it is not locked, positive in tension.
-        locked: whether the opening is a number.
-        opening: how much farther the faces are apart along the axis than drawn, negative in a bolt that is shortened.
+        axis: the direction that points out of the target ``(gdim,)``, available after tying.
+        force: force in the section while it is not locked, positive in tension.
+        locked: whether the opening is constant.
+        opening: change of the distance between the faces along the axis, negative if the bolt is shortened.
     """
 
     def __init__(self, *between: Any, axis: Array | None, free: Bools, **of: Any):
@@ -55,9 +55,9 @@ class Preloaded(Tie):
         self._given_axis, self._free = axis, free
         self.axis: Array = np.zeros(self.config.gdim)
         self.force, self.locked, self.opening = 0.0, False, 0.0
-        #: What an opening of one makes of every row ``(m,)``.
+        #: Value of every row for a unit opening ``(m,)``.
         self._along: Array = np.zeros(0)
-        #: Number of the leading row, -1 on ranks that do not have it, and the rank that does.
+        #: Number of the leading row, -1 on other ranks, and the rank that has it.
         self._lead, self._root = -1, 0
 
     # -- the axis and the leading row ------------------------------------------------------------------------------------
@@ -67,7 +67,7 @@ class Preloaded(Tie):
 
         Raises:
             InputError: if the axis lies in the section.
-            SurfaceError: if conditions hold all of it along the axis.
+            SurfaceError: if conditions prescribe the whole section along the axis.
         """
         n = projection.normal[self._within_reach(state)].sum(axis=0)
         n = np.asarray(reduced(self.config.comm, n))
@@ -85,7 +85,7 @@ class Preloaded(Tie):
         return united
 
     def _within_reach(self, state: PairState) -> Bools:
-        """As of ``Tie``, and contactors at the rim: below them facets are continued past their sides (collective)."""
+        """See ``Tie``; also contactors at the rim, for which facets are continued past their sides (collective)."""
         p = self.target.project(self._points)
         return np.maximum(np.abs(p.gap), p.way_beyond) <= p.facet_size
 
@@ -98,7 +98,7 @@ class Preloaded(Tie):
         if not reduced(comm, len(i)):
             return
         can = self._free[i, c] & (c == main)
-        # rows that follow no other contactor make no rings
+        # rows that contain no other contactor cause no cycles
         alone = can & ~np.isin(i, rows.terms[0][self._is_contactor(rows.terms[1])])
         if reduced(comm, bool(alone.any()), op=MPI.LOR):
             can = alone
@@ -117,7 +117,7 @@ class Preloaded(Tie):
         self._lead = int(here[np.argmin(away)]) if comm.rank == self._root else -1
 
     def _is_contactor(self, nodes: Ints) -> Bools:
-        """Which of these global nodes are contactors of any rank ``(k,)`` (collective)."""
+        """Whether these global nodes are contactors of any rank ``(k,)`` (collective)."""
         mark = np.zeros((self.config.n_owned, 1))
         mark[self.nodes] = 1.0
         return np.asarray(self.config.ask_owners(nodes, mark)[:, 0] > 0)
@@ -126,21 +126,21 @@ class Preloaded(Tie):
 
     @property
     def excluded(self) -> Bools:
-        """As of ``Tie``: all, as loose contactors of the section are in no contact either."""
+        """See ``Tie``; all contactors, since untied contactors of the section have no contact either."""
         return np.ones(len(self.nodes), dtype=bool)
 
     @property
     def knows_conditions(self) -> bool:
-        """As of ``Tie``: the leading row is of a component that is free."""
+        """See ``Tie``; True, since the leading row needs a free component."""
         return True
 
     @property
     def chained(self) -> bool:
-        """As of ``Told``: all rows follow the contactor of the leading one."""
+        """See ``Told``; True, since all rows depend on the contactor of the leading row."""
         return True
 
     def _equations(self) -> UnitingEquations:
-        """As of ``Tie``, gaps counted from the present opening, which is found where it is free (collective)."""
+        """See ``Tie``; gaps relative to the present opening, which is computed if it is free (collective)."""
         if self._here is None:
             here = super()._equations()
             if not self.locked:
@@ -150,7 +150,7 @@ class Preloaded(Tie):
         return self._here
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
-        """As of ``Tie``; while the opening is free, all rows but the leading one, which they follow (collective)."""
+        """See ``Tie``; while the opening is free, all rows except the leading one, on which they depend (collective)."""
         here, (i, c) = self._equations(), np.nonzero(self._has)
         if self.locked:
             return here, i, c
@@ -167,7 +167,7 @@ class Preloaded(Tie):
         followed = np.concatenate([here.followed, np.tile(nodes, len(follow))])
         more = -self._along[follow, None, None] * vectors
         coefficients = np.concatenate([here.coefficients, more.reshape(-1, self.config.gdim)])
-        # what follows its own node belongs to its direction
+        # terms at a row's own node belong to its direction
         direction, itself = here.direction.copy(), followed == self.config.to_global(here.node)[row]
         np.add.at(direction, row[itself], -coefficients[itself])
         made = replace(
@@ -176,16 +176,16 @@ class Preloaded(Tie):
         return made.select(others), i[others], c[others]
 
     def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
-        """As of ``Tie``; the leading row bears what the given force leaves to it (collective)."""
+        """See ``Tie``; the leading row carries the rest of the given force (collective)."""
         bond = super()._bond(contactor, kind, multipliers)
         return bond if self.locked else bond + self._by_lead(self.force - self._pull(bond))
 
     def _pull(self, bond: Array) -> float:
-        """Force across the section of multipliers ``bond (n, gdim)``, positive in tension (collective)."""
+        """Force in the section from multipliers ``bond (n, gdim)``, positive in tension (collective)."""
         return -float(reduced(self.config.comm, float(self._along @ bond[self._has])))
 
     def _by_lead(self, force: float) -> Array:
-        """Multipliers ``(n, gdim)`` of which the leading row alone has one, so that the section carries ``force`` by it."""
+        """Multipliers ``(n, gdim)`` of a section ``force`` that the leading row carries alone."""
         alone = np.zeros(self._has.shape)
         if self._lead >= 0:
             i, c = np.nonzero(self._has)
@@ -194,11 +194,11 @@ class Preloaded(Tie):
 
     @property
     def works(self) -> bool:
-        """As of ``Told``: while the opening is free."""
+        """See ``Told``; True while the opening is free."""
         return not self.locked
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
-        """As of ``Told``: the pair of forces that pulls the faces together while the opening is free (collective)."""
+        """See ``Told``; the pair of forces on the faces while the opening is free (collective)."""
         if self.locked:
             return None
         assert self.rows is not None
@@ -212,25 +212,25 @@ class Preloaded(Tie):
     # -- what is told, and from step to step -----------------------------------------------------------------------------
 
     def carried(self, state: PairState) -> float:
-        """Force across the section in a state, positive in tension (collective)."""
+        """Force in the section in a state, positive in tension (collective)."""
         return 0.0 if state.bond is None else self._pull(state.bond)
 
     def find_opening(self) -> float:
-        """The opening where the bodies are (collective)."""
+        """The opening in the current configuration (collective)."""
         self._equations()
         return self.opening
 
     def lock(self) -> None:
-        """Keep the opening that there is (collective)."""
+        """Lock the present opening (collective)."""
         self.find_opening()
         self.locked, self._here = True, None
 
     def release(self) -> None:
-        """Let the opening be free."""
+        """Make the opening free."""
         self.locked, self._here = False, None
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
-        """As of ``Tie``, with the opening, and whether it is locked (collective)."""
+        """See ``Tie``; with the opening, and whether it is locked (collective)."""
         n, opening = len(self.nodes), self.find_opening()
         return super().to_checkpoint() | {"locked": np.full(n, self.locked), "opening": np.full(n, opening)}
 

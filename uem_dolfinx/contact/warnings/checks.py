@@ -1,6 +1,6 @@
-"""What is refused about a contact pair: deep overlaps at the start, contactors that are stuck inside the target; what is warned of.
+"""Checks of a contact pair: errors for deep initial penetration and contactors held inside the target, and warnings.
 
-Every check speaks on all ranks or on none.
+Every check raises or warns on all ranks or on none.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ SLIPPED = 0.05
 
 
 def check_initial(pair: Interface) -> None:
-    """Refuse an initial penetration beyond the bound, and tell about any other (collective).
+    """Refuse an initial penetration beyond the bound, and warn of any other (collective).
 
     Raises:
-        PenetrationError: naming the deepest node of the first rank that has one.
+        PenetrationError: naming the deepest node of the first rank with such a node.
     """
     gap = np.where(pair.off, np.inf, pair.projection.gap)
     error = None
@@ -77,11 +77,11 @@ def check_initial(pair: Interface) -> None:
 def check_prescribed(pair: Interface) -> None:
     """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
 
-    Or away from where it is tied.
+    Also a tied contactor held away from its tied position.
 
     Raises:
-        ConflictError: naming the deepest or farthest such node of the first rank that has one.
-        OverdeterminedError: likewise, if the node and its target may move and other contacts alone fight its equation.
+        ConflictError: naming the deepest or farthest node of the first rank with such a node.
+        OverdeterminedError: likewise, if the node or its target can move and only other contacts contradict its equation.
     """
     left_out = pair.trial.active & pair.redundant
     depth = -pair.projection.gap / pair.config.size
@@ -113,7 +113,7 @@ def check_prescribed(pair: Interface) -> None:
 
 
 def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -> None:
-    """Tell that a displacement of degree 1 makes straight facets of surfaces that the mesh has curved (collective).
+    """Warn that a displacement of degree 1 has straight facets on curved surfaces of the mesh (collective).
 
     Args:
         config: configuration of the displacement.
@@ -142,24 +142,24 @@ def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -
 
 
 def facet_curvatures(target: MeshTarget) -> Array:
-    """How the normal of the surface behind each of this rank's facets changes along it, and the facet's does not ``(m, gdim, gdim)``.
+    """Curvature of the surface that each of this rank's facets approximates, minus the facet's own ``(m, gdim, gdim)``.
 
-    Positive where the target is convex; zero at corners and on facets that are curved themselves (collective).
+    Positive for a convex target; zero at corners, and on facets that are curved themselves (collective).
     """
     data = target.facets.current()
     normals = target.facets.normals()
     arms, turns = data.x - data.x.mean(axis=1, keepdims=True), data.nodal_normals - normals
-    # facets that meet at a sharp edge are not straight pieces of a curve
+    # facets at a sharp edge do not approximate a curved surface
     turns[np.einsum("mag,mag->ma", data.nodal_normals, normals) < to_mean(SHARP_EDGE)] = 0.0
-    # turn = B arm in the mean
+    # least-squares fit of turn = B arm
     squares = np.einsum("mag,mah->mgh", arms, arms)
     return np.einsum("mag,mah->mgh", turns, arms) @ np.linalg.pinv(squares, rcond=1e-10, hermitian=True)
 
 
 def sagging(pair: Interface) -> tuple[Bools, Array, Array]:
-    """Contactors whose clearance is less than the straight facets of the target sag, how far these do, and the clearances (collective).
+    """Contactors with clearance below the sag of the target's straight facets, the sags, and the clearances (collective).
 
-    Of ``n`` contactors, ``(n,)`` each; none of a target that is no mesh.
+    ``(n,)`` each; no contactors for a rigid target.
     """
     target, p = pair.target, pair.projection
     if not isinstance(target, MeshTarget) or not isinstance(p, FacetProjection):
@@ -173,7 +173,7 @@ def sagging(pair: Interface) -> tuple[Bools, Array, Array]:
 
 
 def warn_of_sagging_facets(pair: Interface) -> None:
-    """Tell that surfaces conform more closely than the straight facets of the target follow its curve (collective)."""
+    """Warn of conforming surfaces whose clearance is below the sag of the target's straight facets (collective)."""
     if not isinstance(pair.target, MeshTarget):
         return
     (close, sag, clearance), p = sagging(pair), pair.projection
@@ -191,7 +191,7 @@ def warn_of_sagging_facets(pair: Interface) -> None:
 
 
 def warn_of_slim_tips(config: Configuration, name: str, surface: TargetFacets) -> None:
-    """Tell that mortar has one equation for facets of a tip that all but face each other (collective).
+    """Warn that mortar has one equation for both sides of a slim tip (collective).
 
     Args:
         config: configuration of the displacement.
@@ -211,7 +211,7 @@ def warn_of_slim_tips(config: Configuration, name: str, surface: TargetFacets) -
 
 
 def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
-    """Tell that contactors have slid off the end of the target, and their share of the surface with them (collective).
+    """Warn of contactors that have slid off the end of the target, with their part of the surface (collective).
 
     Args:
         pair: in equilibrium.
@@ -219,7 +219,7 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
         areas: tributary areas ``(n,)``.
 
     Returns:
-        Whether there was something to tell.
+        Whether a warning was given.
     """
     p = pair.projection
     near = p.way_beyond < 0.5 * p.facet_size
@@ -238,7 +238,7 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
 
 
 def check_new(contacts: Sequence[Any]) -> None:
-    """Refuse contacts that belong to a problem already, or stand in the list twice.
+    """Refuse contacts that already belong to a problem, or occur twice in the list.
 
     Raises:
         SpaceError: naming the first such contact.
@@ -250,7 +250,7 @@ def check_new(contacts: Sequence[Any]) -> None:
 
 
 def check_moved(pair: Interface) -> None:
-    """Refuse a rigid target that is not in the same place on all ranks by an InputError (collective)."""
+    """Raise InputError for a rigid target with different positions on different ranks (collective)."""
     if pair.target.n_nodes or pair.config.comm.size == 1:
         return
     m = pair.target.motion

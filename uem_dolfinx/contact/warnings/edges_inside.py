@@ -1,4 +1,4 @@
-"""Sharp edges that cross each other between their nodes: no node of either is inside the other body, and nothing holds them apart."""
+"""Detection of sharp edges that cross between their nodes, where no nodal condition prevents penetration."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Meeting:
     """Two surfaces whose edges may cross.
 
     Attributes:
-        own: the one.
-        theirs: the other, or the same one.
-        apart: sets of facets that never touch each other, of the surfaces of many bodies.
-        itself: which bodies may touch themselves ``(n_bodies,)``, likewise; None for two surfaces.
+        own: the first surface.
+        theirs: the second surface, or the same.
+        apart: sets of facets that never touch each other, for the joint surface of many bodies.
+        itself: bodies that may touch themselves ``(n_bodies,)``, for such a surface; None for two surfaces.
     """
 
     own: TargetFacets
@@ -46,11 +46,11 @@ class EdgesInside:
 
     @property
     def any(self) -> bool:
-        """Whether both surfaces have any."""
+        """Whether both surfaces have sharp edges."""
         return self._own.total > 0 and self._theirs.total > 0
 
     def _of(self, edges: SharpEdges) -> Ints:
-        """Body of each piece of an edge, and in which sets its facet is ``(k, 1 + 2 n_sets)``; nothing of two surfaces ``(k, 0)``."""
+        """Visibility keys of edge segments: body, and sets of the facet ``(k, 1 + 2 n_sets)``; for two surfaces ``(k, 0)``."""
         skin, f = edges.facets, edges.facet
         if not isinstance(skin, Skin):
             return np.zeros((len(f), 0), dtype=np.int64)
@@ -58,7 +58,7 @@ class EdgesInside:
         return np.column_stack([skin.body[f], *sets]).astype(np.int64)
 
     def _may_meet(self, one: Ints, other: Ints) -> Bools:
-        """Which of pieces, by what ``_of`` tells of them, may meet ``(k,)``."""
+        """Whether edge segments with these visibility keys may touch ``(k,)``."""
         if self._meeting.itself is None:
             return np.ones(len(one), dtype=bool)
         may: Bools = (one[:, 0] != other[:, 0]) | self._meeting.itself[one[:, 0]]
@@ -68,12 +68,12 @@ class EdgesInside:
         return may
 
     def find(self) -> Crossing | None:
-        """The deepest crossing; None for none (collective)."""
+        """The deepest crossing, or None (collective)."""
         return find_crossing(self._own, self._theirs, (self._told[0], self._told[1]), self._may_meet)
 
 
 def warn(name: str, found: Crossing) -> None:
-    """Tell of edges that cross."""
+    """Warn of edges that cross."""
     place = ", ".join(f"{x:.6g}" for x in found.place)
     logger.warning(
         "%s: sharp edges of two surfaces cross between their nodes, %.4g deep inside each other at (%s): contact acts at nodes of the "
