@@ -309,9 +309,9 @@ def petsc_option_used(name: str) -> bool | None:
 
 
 def arrays_of(A: PETSc.Mat) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]] | None:
-    """Where PETSc has the entries of a matrix on one rank: first of every row, columns and values; None if it does not tell.
+    """Views of PETSc's arrays of a matrix on one rank: row starts, columns and values; None without access.
 
-    petsc4py copies them. They are there as long as the matrix is, and has entries in no other places.
+    petsc4py only returns copies. The views are valid as long as the matrix exists and its sparsity is unchanged.
     """
     rows, columns, values = found = [ctypes.c_void_p() for _ in range(3)]
     if A.getType() != "seqaij":

@@ -182,7 +182,7 @@ class Condensed:
                 self.drop()
                 return False
         self._pc, self._made_for = pc, (K, K.stateGet(), P.free)
-        # rows of the transpose are what sparse matrices multiply
+        # transposed and contiguous, for products with sparse matrices
         self._St = np.ascontiguousarray(S.T)
         return True
 

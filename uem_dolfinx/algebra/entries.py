@@ -51,13 +51,13 @@ class Entries:
 
     @staticmethod
     def within(K: PETSc.Mat) -> Entries | None:
-        """Those of a matrix where it has them, to be read while it stays; None of one on several ranks, and where PETSc does not tell."""
+        """Views of a matrix' entries, valid as long as it exists; None on several ranks, or if PETSc gives no access."""
         arrays = compat.arrays_of(K) if K.comm.size == 1 else None
         return None if arrays is None else Entries(*arrays, K)
 
     @staticmethod
     def as_in(K: PETSc.Mat) -> Entries:
-        """Zeros in the places of the entries of ``K``."""
+        """Zeros with the sparsity of ``K``."""
         if K.comm.size == 1:
             indptr, columns = K.getRowIJ()
             return Entries.of_arrays(indptr, columns, np.zeros(len(columns)), K)
@@ -118,10 +118,10 @@ def is_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
 
 
 def rows_are_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
-    """Whether owned rows of A agree with its columns: entries are compared all at once, in a random combination (collective).
+    """Whether owned rows of A agree with its columns, compared by products with a random vector (collective).
 
-    ``space`` is what it acts on. Unknowns of other fields may have no diagonal: their largest entry then takes its place, over the root
-    of the largest diagonal.
+    A acts on ``space``. The diagonal of other fields may be zero: it is then replaced by the row's largest entry over the root of the
+    largest diagonal entry.
     """
     size, one, other = (space.vector() for _ in range(3))
     A.getDiagonal(size)
@@ -129,12 +129,12 @@ def rows_are_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
     if space.mixed:
         largest = float(np.sqrt(size.norm(PETSc.NormType.INFINITY))) or 1.0
         starts, _, values = A.getValuesCSR()
-        # every line has its diagonal
+        # every line has a diagonal entry
         lines = np.maximum.reduceat(np.abs(values), starts[:-1]) if len(values) else values
         root = np.where(root > 0.0, root, lines / largest)
     with np.errstate(divide="ignore", invalid="ignore"):
         size.array[:] = np.random.default_rng(A.comm.rank).choice([-1.0, 1.0], len(root)) / root
         A.mult(size, one)
         A.multTranspose(size, other)
-        # a diagonal that is zero leaves what is no number
+        # zero diagonal entries give NaN
         return bool((np.abs(one.array_r - other.array_r) <= SYMMETRIC * root).all() and root.all())

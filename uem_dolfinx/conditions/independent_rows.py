@@ -1,11 +1,11 @@
-"""Which component each linear equation eliminates, and which equations follow from others: pure algebra of distributed rows.
+"""Eliminated components of linear equations, and redundant equations: pure algebra of distributed rows.
 
-With the equations ``A u = b`` of all ranks and one component p of each, ``A_p`` being the columns of these, the independent rows are
+With the equations ``A u = b`` of all ranks and one component p of each, with columns ``A_p``, the independent rows are
 
     R = T A,    R u = T b,    R_p = 1
 
-Most equations have a component that no other one has, which goes at once, and T only divides by its coefficient. Those that are left
-without one, as at the edges of cells that are periodic in several directions, are solved together by elimination, on every rank.
+Most equations have a component that no other one has; it is eliminated directly, and T only divides by its coefficient. Other equations,
+e.g. at the edges of cells that are periodic in several directions, are solved together by elimination, on every rank.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class Solved:
-    """Independent rows, of which this rank has those whose eliminated node it owns.
+    """Independent rows whose eliminated nodes this rank owns.
 
     Attributes:
         pivot: eliminated component, as ``global node * gdim + component`` ``(m,)``.
-        row: the row of each entry of R but those of the pivots ``(k,)``.
-        column: component of each, likewise numbered ``(k,)``.
+        row: the row of each entry of R except the pivots ``(k,)``.
+        column: component of each entry, numbered as ``pivot`` ``(k,)``.
         entry: of R ``(k,)``.
         weight_row: the row of each entry of T ``(l,)``.
-        weight_value: number of the value b that it takes ``(l,)``.
+        weight_value: number of the value b that it multiplies ``(l,)``.
         weight: of T ``(l,)``.
     """
 
@@ -49,7 +49,7 @@ class Solved:
 
 
 def sizes(config: Configuration, rows: GivenRows, free: Bools) -> Array:
-    """Sizes of the coefficients that can be eliminated by, over the largest of their rows ``(k, gdim)`` (collective).
+    """Sizes of coefficients of components that can be eliminated, relative to the largest in their row ``(k, gdim)`` (collective).
 
     Args:
         config: configuration of the displacement.
@@ -64,13 +64,13 @@ def sizes(config: Configuration, rows: GivenRows, free: Bools) -> Array:
 
 
 def singles(config: Configuration, rows: GivenRows, size: Array, spared: Bools) -> Ints:
-    """Components that a row has alone when those before it are gone, ``term * gdim + component (m,)``; -1 for none (collective).
+    """Components that occur in one remaining row only, ``term * gdim + component (m,)``, or -1 (collective).
 
     Args:
         config: configuration of the displacement.
         rows: of this rank.
         size: as returned by ``sizes``; rows of zeros are ignored.
-        spared: terms of nodes that are eliminated only where nothing else can be ``(k,)``.
+        spared: mask of terms of nodes that are eliminated only if no other node can be ``(k,)``.
     """
     g, counted = config.block, (size > 0).astype(float)
     counts, halo = config.add_at_owners(rows.node, counted), Halo(config, rows.node)
@@ -94,7 +94,7 @@ def singles(config: Configuration, rows: GivenRows, size: Array, spared: Bools) 
 
 
 def divided(rows: GivenRows, chosen: Ints) -> Solved:
-    """Rows that each eliminate a component which they alone have; of any node."""
+    """Rows that each eliminate a component which no other row has; of any node."""
     m, g = len(rows), rows.coefficients.shape[1]
     column = (rows.node[:, None] * g + np.arange(g)).ravel()
     scale = rows.coefficients.ravel()[chosen]
@@ -104,7 +104,7 @@ def divided(rows: GivenRows, chosen: Ints) -> Solved:
 
 
 def eliminated(config: Configuration, rows: GivenRows, item: Ints, size: Array, spared: Bools) -> tuple[Solved, Bools]:
-    """Rows that share all of their components, solved in the order of their declaration and place (collective).
+    """Rows that share all of their components, solved in the order of their declaration and position (collective).
 
     Args:
         config: configuration of the displacement.
@@ -114,7 +114,7 @@ def eliminated(config: Configuration, rows: GivenRows, item: Ints, size: Array, 
         spared: as in ``singles``.
 
     Returns:
-        The independent rows whose nodes this rank owns, and which of the given ones follow from those before them ``(m,)``.
+        The independent rows whose nodes this rank owns, and the mask of given rows that follow from earlier ones ``(m,)``.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -151,10 +151,10 @@ def eliminated(config: Configuration, rows: GivenRows, item: Ints, size: Array, 
 
 
 def _gauss_jordan(A: Array, free: Bools, spare: Bools) -> tuple[Array, Array, Ints]:
-    """``R = T A`` with a column of the identity for each row that does not follow from those before it.
+    """``R = T A`` with a column of the identity for each row that does not follow from earlier rows.
 
     Returns:
-        R, T, and each row's column, -1 where it follows.
+        R, T, and each row's column, -1 for rows that follow from others.
     """
     m = len(A)
     R, T, pivot = A.copy(), np.eye(m), np.full(m, -1)
@@ -176,7 +176,7 @@ def _gauss_jordan(A: Array, free: Bools, spare: Bools) -> tuple[Array, Array, In
 
 
 def _owned(config: Configuration, made: list[tuple[Ints, Array, Ints, Array, Ints]]) -> Solved:
-    """Those of solved groups whose pivots are of nodes that this rank owns."""
+    """Rows of solved groups whose pivots are at nodes that this rank owns."""
     none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
     lists: list[list[Any]] = [[numbers], [numbers], [numbers], [none], [numbers], [numbers], [none]]
     count = 0

@@ -4,7 +4,7 @@ With weights w of sum 1, the middle ``m = sum w x`` and arms ``r = x - m``, a fo
 
     f_i = w_i (f + a x r_i),    S a = t + (p - m) x f,    S = sum w (|r|^2 1 - r r')
 
-which have their sum and their moment, and are nearest to a uniform distribution.
+with the same resultant and moment; this is the distribution nearest to a uniform one.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from uem_dolfinx.parallel import reduced
 
 
 def velocities(arms: Array) -> Array:
-    """Velocities of points at ``arms (n, gdim)`` in translations and unit turns about the axes ``(n, gdim, gdim + n_turns)``."""
+    """Velocities of points at ``arms (n, gdim)`` in translations and unit rotations about the axes ``(n, gdim, gdim + n_turns)``."""
     n, g = arms.shape
     shifts = np.broadcast_to(np.eye(g), (n, g, g))
     return np.concatenate([shifts, turned(np.eye(1 if g == 2 else 3)[:, None], arms).transpose(1, 2, 0)], axis=2)
 
 
 def turned(turns: Array, arms: Array) -> Array:
-    """``turns x arms`` of vectors ``(..., n_turns)`` and ``(..., gdim)``; in the plane a turn is one number."""
+    """``turns x arms`` of vectors ``(..., n_turns)`` and ``(..., gdim)``; in 2D a rotation is one number."""
     if arms.shape[-1] == 3:
         return cross_products(turns, arms)
     return np.asarray(turns * np.stack([-arms[..., 1], arms[..., 0]], axis=-1))
 
 
 def moments(arms: Array, forces: Array) -> Array:
-    """``arms x forces (..., gdim)``; one number each in the plane, ``(..., n_turns)``."""
+    """``arms x forces (..., gdim)``: ``(..., n_turns)``, one number each in 2D."""
     if arms.shape[-1] == 3:
         return cross_products(arms, forces)
     return np.asarray(arms[..., :1] * forces[..., 1:] - arms[..., 1:] * forces[..., :1])
@@ -42,22 +42,22 @@ def moments(arms: Array, forces: Array) -> Array:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a set is as one rigid body.
+    """Position and orientation of a set as one rigid body.
 
     Attributes:
-        motion: from the drawing to the present, about the middle of the set.
-        small: small turn ``(n_turns,)`` in place of the motion's own; None for a finite one.
+        motion: from the reference configuration to the present, about the middle of the set.
+        small: small rotation ``(n_turns,)`` instead of the motion's rotation; None for a finite rotation.
     """
 
     motion: Motion
     small: Array | None = None
 
     def arms(self, X: Array) -> Array:
-        """Arms from the middle of points ``X (n, gdim)`` of the drawing."""
+        """Present arms from the middle to points with reference positions ``X (n, gdim)``."""
         return (X - self.motion.about) @ self.motion.Q.T
 
     def displacement(self, X: Array) -> Array:
-        """Displacement of points ``X (n, gdim)`` of the drawing."""
+        """Displacement of points with reference positions ``X (n, gdim)``."""
         if self.small is None:
             return self.motion.translation + (X - self.motion.about) @ (self.motion.Q - np.eye(X.shape[1])).T
         return self.motion.translation + turned(self.small, X - self.motion.about)
@@ -69,18 +69,18 @@ class Placement:
 
 
 class RigidSet:
-    """Nodes and weights of them (collective).
+    """Nodes of a rigid coupling, with its point (collective).
 
     Args:
         config: configuration of the displacement.
-        nodes: owned ones.
-        point: goes with them, in the drawing ``(gdim,)``.
-        large: whether turns are finite.
+        nodes: owned nodes.
+        point: moves with the nodes, reference position ``(gdim,)``.
+        large: whether rotations are finite.
 
     Attributes:
-        X: the nodes in the drawing ``(n, gdim)``.
-        middle: mean of these over all ranks ``(gdim,)``.
-        radius: root of their mean squared distance from it, a length.
+        X: reference positions of the nodes ``(n, gdim)``.
+        middle: their mean over all ranks ``(gdim,)``.
+        radius: root of their mean squared distance from the middle, a length.
     """
 
     def __init__(self, config: Configuration, nodes: Indices, point: Array, large: bool):
@@ -92,7 +92,7 @@ class RigidSet:
 
     @property
     def scale(self) -> Array:
-        """Of shifts and turns, by which unit turns move the nodes by as much as unit shifts do ``(gdim + n_turns,)``."""
+        """Scales of translations and rotations, so that unit ones move the nodes by the same amount ``(gdim + n_turns,)``."""
         g = self.config.gdim
         return np.append(np.ones(g), np.full(1 if g == 2 else 3, 1.0 / self.radius))
 
@@ -102,12 +102,12 @@ class RigidSet:
 
     @property
     def drawn(self) -> Placement:
-        """Where it was drawn."""
+        """Its placement in the reference configuration."""
         g = self.config.gdim
         return Placement(Motion(np.zeros(g), np.eye(g), self.middle), None)
 
     def placement(self, u: Array) -> Placement:
-        """Where a displacement ``(n_owned, gdim)`` takes it: the nearest rigid motion (collective)."""
+        """The nearest rigid placement for a displacement ``(n_owned, gdim)`` (collective)."""
         own, arms, g = u[self.nodes], self.X - self.middle, self.config.gdim
         if not self.large:
             z = self.motion_of(self.drawn, u)
@@ -116,19 +116,19 @@ class RigidSet:
         spread = self._mean(arms[:, :, None] * arms[:, None, :])
         left, _, right = np.linalg.svd(sums[:, 1:] + spread)
         left[:, -1] *= np.sign(np.linalg.det(left @ right))
-        # sums over many nodes round where they come from: what is left of the displacement tells by how much
+        # sums over many nodes have rounding errors: the translation is corrected by the mean of the remaining displacement
         near = Placement(Motion(sums[:, 0], left @ right, self.middle))
         return Placement(Motion(sums[:, 0] + self._mean(own - near.displacement(self.X)), left @ right, self.middle))
 
     def motion_of(self, at: Placement, rates: Array) -> Array:
-        """Shift and turn about the middle nearest to rates of all owned nodes ``(n_owned, gdim)``: ``(gdim + n_turns,)`` (collective)."""
+        """Translation and rotation about the middle nearest to rates ``(n_owned, gdim)``: ``(gdim + n_turns,)`` (collective)."""
         own = rates[self.nodes]
         V = velocities(at.arms(self.X)) * self.scale
         sums = self._mean(np.concatenate([np.einsum("ngz,ngy->nzy", V, V), np.einsum("ngz,ng->nz", V, own)[:, :, None]], axis=2))
         return self.scale * np.asarray(np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=None)[0], dtype=float)
 
     def spread(self, u: Array, force: Array, moment: Array) -> Array:
-        """Forces at the nodes that a force and a moment at the point are ``(n, gdim)`` (collective)."""
+        """Nodal forces ``(n, gdim)`` equivalent to a force and a moment at the point (collective)."""
         if not (force.any() or moment.any()):
             return np.zeros_like(self.X)
         if self.large:

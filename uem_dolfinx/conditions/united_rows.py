@@ -195,15 +195,15 @@ class UnitedRows:
         """Nothing: the equations are linear."""
 
     def curvature(self) -> list[tuple[Ints, Array]]:
-        """Nothing, likewise."""
+        """Nothing: the equations are linear."""
         return []
 
     def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
-        """Nothing, likewise."""
+        """Nothing: the equations are linear."""
         return []
 
     def settle(self, dynamics: Any) -> None:
-        """Nothing, likewise."""
+        """Nothing: the equations are linear."""
 
     def at_present(self) -> UnitingEquations:
         """The equations with the gaps of the present displacement (collective)."""
@@ -245,7 +245,7 @@ class UnitedRows:
         """Forces with which the equations act on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective).
 
         Args:
-            multipliers: forces along what they eliminate ``(m,)``.
+            multipliers: forces along their eliminated components ``(m,)``.
         """
         return forces_of(self._config, self.equations, multipliers)
 

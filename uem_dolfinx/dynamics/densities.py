@@ -1,4 +1,4 @@
-"""Densities as users hand them over, and the masses of cells that they make."""
+"""Densities given by users, and the resulting masses of cells."""
 
 from __future__ import annotations
 

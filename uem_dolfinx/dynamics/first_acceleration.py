@@ -1,4 +1,4 @@
-"""Acceleration of united bodies under forces, with which a motion begins."""
+"""Initial acceleration of constrained bodies under forces."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def united_accelerations(
     """``P a`` with ``P'MP a = P' forces``, zero in components without mass (collective).
 
     Args:
-        mass: M, with the rows and columns of the united system.
+        mass: M, with the rows and columns of the constrained system.
         restriction: P.
         forces: on all unknowns.
-        added: what masses at points add to M.
+        added: masses at points, in addition to M.
 
     Raises:
         LinearSolveError: if masses are negative.

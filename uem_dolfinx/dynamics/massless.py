@@ -1,8 +1,8 @@
-"""Which nodes of the contact surfaces are massless: the contactors, and the nodes that they follow wherever a body can carry it.
+"""Massless nodes of the contact surfaces: the contactors, and, if the rest of the body can take their mass, the nodes that they follow.
 
-A contactor and the nodes that it follows move as one. Mass on either side would sit on the cells of both surfaces as on a spring
-that is faster than anything else in the meshes: impact excites it, nothing takes its vibration away, and the trapezoidal rule turns
-it into energy whenever the contact opens. Without mass on both sides the contact force is static, the gap's own reaction.
+A contactor and the nodes that it follows move together. Mass on either side would form an oscillator with the cells of both surfaces,
+of the highest frequency in the meshes. Impact excites it, nothing damps it, and the trapezoidal rule adds energy whenever the contact
+opens. Without mass on both sides the contact force is the static reaction of the gap.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def contactor_nodes(contacts: Sequence[Contact]) -> Indices:
 
 
 def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
-    """The same bodies with massless contactors, and massless targets in the bodies that can do without both (collective).
+    """The same bodies with massless contactors, and massless targets in bodies whose other nodes can take the mass (collective).
 
     Raises:
-        MassError: if a body cannot do without the mass of its contactors, with the part of them, if any, whose mass it could spare.
+        MassError: if the other nodes of a body cannot take the mass of its contactors, with the part that could be massless, if any.
     """
     config, contacts = mass.config, [contact for contact in contacts if contact.tied is not True]
     of_all = [contact for contact in contacts if contact.of_all_surfaces]
@@ -50,7 +50,7 @@ def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
 
 
 def _warn_of_mass(mass: Mass, name: str, nodes: Indices) -> None:
-    """Warn, once, of bodies whose contactors keep their mass since the others could not take it over (collective)."""
+    """Warn, once, of bodies whose contactors keep their mass because other nodes cannot take it (collective)."""
     body, count = find_bodies(mass.config)
     kept = np.zeros(count, bool)
     kept[body[nodes[mass.of_nodes[nodes].any(axis=1)]]] = True
@@ -64,9 +64,9 @@ def _warn_of_mass(mass: Mass, name: str, nodes: Indices) -> None:
 
 
 def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Callable[[], Array]) -> None:
-    """Warn of contactors that are stiffer than a target which has kept its mass (collective).
+    """Warn of contactors that are stiffer than a target with mass (collective).
 
-    The mass of such a target vibrates on the surface cells of both sides, all the more the stiffer those of the contactor are.
+    The mass of such a target vibrates on the surface cells of both sides, more strongly for stiffer cells of the contactor.
 
     Args:
         mass: of the bodies, with massless contactors.
@@ -98,20 +98,20 @@ def _followed(config: Configuration, contact: Contact) -> Bools:
 
 
 def _distances(contactors: Indices, contacts: Sequence[Contact]) -> Array:
-    """Of ``contactors (n,)`` from the targets, the nearest one that each of them may touch ``(n,)`` (collective)."""
+    """Distance of each of the ``contactors (n,)`` from the nearest target that it may touch ``(n,)`` (collective)."""
     found = np.full(len(contactors), np.inf)
     for whole in {id(contact.pair.whole): contact.pair.whole for contact in contacts}.values():
         whole.project()
     for contact in contacts:
         pair = contact.pair
-        # the foot on a rigid surface is the contactor itself
+        # on a rigid surface the closest point is the contactor itself
         away = np.maximum(np.linalg.norm(pair.points - pair.projection.foot, axis=1), np.abs(pair.projection.gap))
         np.minimum.at(found, np.searchsorted(contactors, pair.nodes), away)
     return found
 
 
 def _stiffness_per_area(config: Configuration, part: object, K: Array) -> float:
-    """Mean diagonal of K at the nodes of a surface over their areas; 0 for points and where K is not known (collective)."""
+    """Mean diagonal of K at the nodes of a surface over their areas; 0 for points and for unknown K (collective)."""
     if not isinstance(part, Tag):
         return 0.0
     nodes = surface_nodes(config, part)

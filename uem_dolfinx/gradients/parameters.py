@@ -1,4 +1,4 @@
-"""Parameters of contacts as controls of gradients, and how gaps and contact forces change with them at the same displacement."""
+"""Parameters of contacts as controls of gradients, and derivatives of gaps and contact forces by them at fixed displacement."""
 
 from __future__ import annotations
 
@@ -52,22 +52,22 @@ class ContactParameter:
             )
 
     def shape(self, gdim: int) -> tuple[int, ...]:
-        """Of its derivative."""
+        """Shape of its derivative."""
         return {"place": (gdim,), "turn": () if gdim == 2 else (3,)}.get(self.parameter, ())
 
 
 def keeps_distance(contact: Contact) -> bool:
-    """Whether the gaps of a contact are distances from its target wherever contactors are: those of any mesh are."""
+    """Whether the gaps of a contact are distances from its target for all positions, as for any mesh."""
     return not hasattr(contact.target, "project") or getattr(contact.target, "measures", False)
 
 
 def led_for(m: object) -> object:
-    """The object that steps lead for a control: the contact for its offset, else the control itself."""
+    """The object that steps ramp for a control: the contact for its offset, otherwise the control itself."""
     return m.contact if isinstance(m, ContactParameter) and m.parameter == "offset" else m
 
 
 def motion_of(m: ContactParameter, x: Array, entry: tuple[int, ...]) -> Array:
-    """How points ``x (n, gdim)`` of a rigid target move with an entry of its place or turn ``(n, gdim)``."""
+    """Velocities ``(n, gdim)`` of points ``x (n, gdim)`` of a rigid target for a unit rate of an entry of its place or turn."""
     if m.parameter == "place":
         return np.tile(np.eye(x.shape[1])[entry[0]], (len(x), 1))
     target = m.contact.pair.target
@@ -75,12 +75,12 @@ def motion_of(m: ContactParameter, x: Array, entry: tuple[int, ...]) -> Array:
 
 
 def turned_by(entry: tuple[int, ...], v: Array) -> Array:
-    """How vectors ``(n, gdim)`` change with an angle of turn."""
+    """Derivatives of vectors ``(n, gdim)`` by a rotation angle."""
     return turned(np.eye(3)[entry[0]] if entry else np.ones(1), v)
 
 
 def thickened(pair: Interface, multipliers: Array) -> tuple[Array, Array]:
-    """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` with the offset, in which both are linear (collective)."""
+    """Derivatives of gaps ``(m,)`` and residual ``(n_owned, gdim)`` by the offset, in which both are linear (collective)."""
     d, kinematics = pair.discretisation, pair.kinematics
     more = THICKER * float(reduced(pair.config.comm, _least_side(pair), op=MPI.MIN))
     before, length = d.offset, pair.kinematics.gap_rows.scale
@@ -96,7 +96,7 @@ def thickened(pair: Interface, multipliers: Array) -> tuple[Array, Array]:
 
 
 def _least_side(pair: Interface) -> float:
-    """Of a contactor's facet here, a length; the model's size where rows do not depend on the offset."""
+    """Shortest side of this rank's contactor facets, a length; the model's size if rows do not depend on the offset."""
     if not isinstance(pair.discretisation, Mortar):
         return pair.config.size
     x = pair.discretisation.surface.x
@@ -104,7 +104,7 @@ def _least_side(pair: Interface) -> float:
 
 
 def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array) -> tuple[Array, Array]:
-    """Gaps of equations ``(m,)`` and contact forces at the owned nodes, as if they were divided by another ``length (n,)`` (collective)."""
+    """Gaps of equations ``(m,)`` and contact forces at the owned nodes, scaled to another ``length (n,)`` (collective)."""
     if isinstance(pair.discretisation, Mortar) and isinstance(pair.kinematics, MortarKinematics):
         pair.kinematics = pair.discretisation.with_variation(pair.kinematics)
     own, config = pair.equations(), pair.config
@@ -113,7 +113,7 @@ def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array) -> tupl
 
 
 def rubbed(pair: Interface) -> Array:
-    """Change of the residual with the coefficient of friction ``(n_owned, gdim)`` (collective)."""
+    """Derivative of the residual by the coefficient of friction ``(n_owned, gdim)`` (collective)."""
     sliding = pair.friction
     assert sliding is not None
     if reduced(pair.config.comm, bool((sliding.value == 0.0).any()), op=MPI.LOR):

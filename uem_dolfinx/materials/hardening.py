@@ -1,4 +1,4 @@
-"""Yield curves: the yield stress over the equivalent plastic strain, at many points at once, and how far a trial stress flows along it."""
+"""Yield curves: yield stress over the equivalent plastic strain at many points, and plastic increments of trial stresses."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Voce:
     """Hardening that saturates: ``increase (1 - exp(-peeq / strain)) + slope peeq`` [Voce, Metallurgia 51 (1955) 219-226].
 
     Attributes:
-        increase: of the yield stress in the end, a stress.
-        strain: equivalent plastic strain by which it has come to 63 % of that.
+        increase: total increase of the yield stress at saturation, a stress.
+        strain: equivalent plastic strain at 63 % of this increase.
         slope: linear hardening in addition, a stress.
 
     Raises:
@@ -38,11 +38,11 @@ class Voce:
 
 
 class YieldCurve(Protocol):
-    """Yield stress over the equivalent plastic strain at n points; ``i`` are those of some of them ``(m,)``."""
+    """Yield stress over the equivalent plastic strain at n points; ``i (m,)`` are numbers of some points."""
 
     @property
     def parameters(self) -> dict[str, Array]:
-        """What it is made of, by name."""
+        """Its parameters by name."""
 
     def at(self, peeq: Array, i: Ints) -> tuple[Array, Array]:
         """Yield stress and its slope at ``peeq (m,)``."""
@@ -51,7 +51,7 @@ class YieldCurve(Protocol):
         """Root ``dp (m,)`` of ``q - stiff dp = yield stress at (peeq + dp)``, for q above the yield stress at ``peeq``."""
 
     def work(self, peeq: Array) -> Array:
-        """Integral of the yield stress from 0 to ``peeq (n,)``, zero where nothing has flowed."""
+        """Integral of the yield stress from 0 to ``peeq (n,)``, zero without plastic flow."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def read_pairs(what: str, points: Any, expected: str) -> tuple[Array, Array]:
     """Plastic strains from 0 upwards and stresses that do not fall, each ``(m,)``.
 
     Raises:
-        InputTypeError, InputError: if they are none, with what was expected.
+        InputTypeError, InputError: for other objects, with the expected form.
     """
     words = given.sentence(what, points, expected)
     try:
@@ -182,7 +182,7 @@ def read_table(points: Any, slope: Any) -> Tabulated:
     """A table of equivalent plastic strain against yield stress, and the slope behind its last point.
 
     Raises:
-        InputTypeError, InputError: if it is none, with what was expected.
+        InputTypeError, InputError: for other objects, with the expected form.
     """
     expected = "pairs (plastic strain, yield stress), strains from 0 upwards, stresses positive and not falling"
     strains, stresses = read_pairs("yield_stress", points, expected)

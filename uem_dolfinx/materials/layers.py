@@ -1,4 +1,4 @@
-"""Tabulated kinematic hardening: at every point parallel layers that share the strain, each perfectly plastic at its own yield stress.
+"""Tabulated kinematic hardening: parallel, perfectly plastic layers with the same strain and different yield stresses at every point.
 
 [Besseling, Journal of Applied Mechanics 25 (1958) 529-536; Owen, Prakash and Zienkiewicz, Computers and Structures 4 (1974) 1251-1267]
 """
@@ -27,7 +27,7 @@ SAME_SLOPE = 1e-9
 class BackTable:
     """Back stress over the plastic strain in uniaxial tension, both ``(j,)`` from 0: straight lines, and a constant beyond the last point.
 
-    ``slopes (j,)`` follow the points, and fall.
+    ``slopes (j,)`` are the slopes after each point, and decrease.
     """
 
     strains: Array
@@ -35,15 +35,15 @@ class BackTable:
 
     @property
     def slopes(self) -> Array:
-        """Behind each point."""
+        """Slopes after each point."""
         return np.append(np.diff(self.stresses) / np.diff(self.strains), 0.0)
 
     @staticmethod
     def read(points: Any) -> BackTable:
-        """Of pairs (plastic strain, back stress); points on a straight line are left out.
+        """The table of pairs (plastic strain, back stress), without intermediate points on straight lines.
 
         Raises:
-            InputTypeError, InputError: if they are none, naming what was expected.
+            InputTypeError, InputError: for other objects, with the expected form.
         """
         expected = "pairs (plastic strain, back stress) from (0, 0), strains rising, stresses not falling, slopes not rising"
         strains, stresses = read_pairs("kinematic_hardening", points, expected)
@@ -64,11 +64,11 @@ class BackTable:
 
 @dataclass(frozen=True)
 class Layers:
-    """j layers at each of n points. Arrays of layers have n j rows, those of one point one after another.
+    """j layers at each of n points. Arrays of layers have n j rows, with the layers of one point one after another.
 
-    Layers have the elasticity of the body and, as flow keeps the volume, its pressure. Their deviators in uniaxial tension are parallel:
-    with the yield stress Y a layer flows from the strain ``p_i + (Y + X_i) / (3 mu)`` of the deviator on, at which the tabulated curve
-    ``Y + X(p)`` has its i-th bend. Its slope over this strain is ``3 mu`` times the weights of all layers that do not flow yet, so that
+    Layers have the elasticity of the body and, since flow is isochoric, its pressure. Their deviators in uniaxial tension are parallel:
+    with the yield stress Y layer i yields at the deviatoric strain ``p_i + (Y + X_i) / (3 mu)``, where the tabulated curve ``Y + X(p)``
+    has its i-th bend. The slope over this strain is ``3 mu`` times the weights of all layers that are still elastic, so that
 
         yield stress i = Y + X_i + 3 mu p_i,    sum of the weights up to i = 3 mu / (3 mu + slope behind i).
 
@@ -82,7 +82,7 @@ class Layers:
 
     @staticmethod
     def of(table: BackTable, yield_stress: Array, mu: Array) -> Layers:
-        """Whose uniaxial curve is ``yield_stress (n,)`` and the table; ``mu (n,)``."""
+        """Layers with the uniaxial curve of ``yield_stress (n,)`` and the table; ``mu (n,)`` is the shear modulus."""
         stiff = 3 * mu[:, None]
         parts = stiff / (stiff + table.slopes)
         stresses = (yield_stress[:, None] + table.stresses + stiff * table.strains).ravel()
@@ -94,18 +94,18 @@ class Layers:
         return self.weights.shape[1]
 
     def repeat(self, values: Array) -> Array:
-        """For each layer those of its point ``(n, ...)``."""
+        """Values of points ``(n, ...)``, repeated for each layer ``(n j, ...)``."""
         return np.repeat(values, self.count, axis=0)
 
     def mean(self, values: Array) -> Array:
-        """Of values of layers ``(n j, ...)``, by their weights ``(n, ...)``."""
+        """Weighted mean ``(n, ...)`` of values of layers ``(n j, ...)``."""
         each = values.reshape(*self.weights.shape, *values.shape[1:])
         return np.einsum("nj,nj...->n...", self.weights, each)
 
     def logarithmic_return(
         self, gradient: Array, plastic_strain: Array, peeq: Array, mu: Array, components: Sequence[Ints]
     ) -> Flowed:
-        """That of all layers in finite strain: their history ``(n j, k)`` and ``(n j,)``, the rest of the body."""
+        """Return of all layers in finite strain: their history ``(n j, k)`` and ``(n j,)``, and means for the body."""
         mu, gradient = self.repeat(mu), self.repeat(gradient)
         each = logarithmic_return(gradient, plastic_strain, peeq, mu, self.curve, components)
         stress, piola, tangent, energy = (
@@ -114,7 +114,7 @@ class Layers:
         return Flowed(stress, piola, tangent, each.plastic_strain, each.peeq, energy)
 
     def radial_return(self, strain: Array, plastic_strain: Array, peeq: Array, mu: Array) -> Returned:
-        """That of all layers: their history ``(n j, k)`` and ``(n j,)``, and j vectors m; the rest of the body."""
+        """Return of all layers: their history ``(n j, k)`` and ``(n j,)``, j vectors m, and means for the body."""
         mu, none = self.repeat(mu), np.zeros_like(peeq)
         each = radial_return(self.repeat(strain), plastic_strain, peeq, mu, self.curve.yield_stress, none, none)
         m = np.sqrt(self.weights).reshape(-1, 1) * each.m
@@ -124,24 +124,24 @@ class Layers:
         )
 
     def plane_stress_return(self, strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array) -> Returned:
-        """That of all layers, which also share the strain across the plane, at which the body is free of stress across it.
+        """Return of all layers with the same out-of-plane strain, for which the body's out-of-plane stress is zero.
 
-        The stress across grows with this strain: Newton's method, kept between strains known to be too small and too large.
+        This stress increases with the strain: Newton's method, safeguarded by lower and upper bounds of the strain.
 
         Args:
             strain: in the plane ``(n, 3)``.
-            plastic_strain: committed, of layers, with the part across, as in plane strain ``(n j, 4)``.
+            plastic_strain: committed, of layers, with the out-of-plane component, as in plane strain ``(n j, 4)``.
             peeq: committed, of layers ``(n j,)``.
             E: Young's modulus ``(n,)``.
             nu: Poisson's ratio ``(n,)``.
 
         Returns:
-            Stress of the body in the plane, NaN where no strain was found; history of layers; j + 1 vectors m.
+            Stress of the body in the plane, NaN without convergence; history of layers; j + 1 vectors m.
         """
         mu, bulk = E / (2 * (1 + nu)), E / (3 * (1 - 2 * nu))
         full, plane, one = np.insert(strain, 2, 0.0, axis=1), [0, 1, 3], np.array([1.0, 1.0, 0.0])
         low, high = np.full(len(strain), -np.inf), np.full(len(strain), np.inf)
-        # as if nothing flowed on
+        # initial guess: elastic step
         step = 2 * mu * self.mean(plastic_strain)[:, 2] - (bulk - 2 / 3 * mu) * strain[:, :2].sum(axis=1)
         step /= bulk + 4 / 3 * mu
         for _ in range(MAX_STEPS):
@@ -159,7 +159,7 @@ class Layers:
             step[i] = (low[i] + high[i]) / 2 - now[i]
         stress = each.stress[:, plane] + pressure[:, None] * one
         stress[~settled] = np.nan
-        # the strain across follows: derivative of the stress in the plane by it
+        # condensation of the out-of-plane strain: derivative of the stress in the plane by it
         mixed = c[:, None] * one - np.einsum("nj,njk->nk", m[:, :, 2], m[:, :, plane])
         last = mixed / np.sqrt(stiff)[:, None]
         vectors = np.concatenate([m[:, :, plane].reshape(len(full), 3 * self.count), last], axis=1)

@@ -95,9 +95,9 @@ def logarithmic_return(
 def _principal_tangent(change: Array, d: Array, s: Array, a: Array, c: Array, basis: Array) -> Array:
     """Derivative of the stress ``s F^-T F'`` by the velocity gradient in principal axes, times a basis ``(3, 3, n_components, n)``.
 
-    Along the axes it is that of small strains, ``a (I - 1 x 1 / 3) - c d x d``, less s. Across them, with b the squares of the trial
-    stretches and ``t = (s_i - s_j) / (b_i - b_j)``, component ij is ``t b_j`` by ij and ``t b_i - s_i`` by ji. ``change``, ``d`` and
-    ``s`` are ``(3, n)``.
+    Normal components are those of small strains, ``a (I - 1 x 1 / 3) - c d x d``, minus s. For shear components, with b the squares of
+    the trial stretches and ``t = (s_i - s_j) / (b_i - b_j)``, component ij is ``t b_j`` by ij and ``t b_i - s_i`` by ji. ``change``,
+    ``d`` and ``s`` are ``(3, n)``.
     """
     out = np.empty_like(basis)
     own = basis[[0, 1, 2], [0, 1, 2]]
@@ -112,7 +112,7 @@ def _principal_tangent(change: Array, d: Array, s: Array, a: Array, c: Array, ba
 
 
 def logarithm_slope(r: Array) -> Array:
-    """``log(1 + r) / r``, 1 at 0: of a ratio 1 + r, so that there is no difference of equals."""
+    """``log(1 + r) / r``, 1 at 0, for a ratio 1 + r, without cancellation."""
     same = r == 0
     return np.where(same, 1.0, np.log1p(r) / np.where(same, 1.0, r))
 

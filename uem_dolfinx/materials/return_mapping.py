@@ -1,4 +1,4 @@
-"""Return of stresses onto the von Mises yield surface, at many points at once."""
+"""Return mapping to the von Mises yield surface, vectorised over points."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Returned:
     """Stress, history and tangent after a return, at n points.
 
     Vectors hold the k components (11, 22, sqrt(2) 12) in plane stress, (11, 22, 33, sqrt(2) 12) in plane strain and axisymmetry, and
-    (11, 22, 33, sqrt(2) 23, sqrt(2) 13, sqrt(2) 12) in 3D, so that their dot product is that of the tensors.
+    (11, 22, 33, sqrt(2) 23, sqrt(2) 13, sqrt(2) 12) in 3D, so that their dot product equals the tensors' inner product.
 
     Attributes:
         stress: the stress in plane stress, otherwise its deviator, ``(n, k)``.
@@ -59,9 +59,9 @@ def radial_return(
 ) -> Returned:
     """Return of the deviator along its own direction, except in plane stress (Simo and Hughes, Computational Inelasticity, box 3.1).
 
-    Strains ``(n, k)``, ``plastic_strain`` and ``peeq (n,)`` the committed ones, have components as in ``Returned``, here k = 4 or 6;
-    parameters are ``(n,)``: shear modulus, ``yield_stress`` at no plastic strain, infinite where elastic, ``hardening``, its slope
-    over ``peeq``, and ``modulus``, 3/2 of the back stress over the plastic strain. The tangent is the deviator's.
+    Strains ``(n, k)``, with committed ``plastic_strain`` and ``peeq (n,)``, have components as in ``Returned``, here k = 4 or 6.
+    Parameters are ``(n,)``: shear modulus, initial ``yield_stress``, infinite at elastic points, ``hardening``, its slope over
+    ``peeq``, and ``modulus``, 3/2 of the back stress over the plastic strain. The tangent is the derivative of the deviator.
     """
     s = strain - plastic_strain
     s[:, :3] -= s[:, :3].mean(axis=1, keepdims=True)
@@ -76,7 +76,7 @@ def radial_return(
     stiff = 3 * mu[i] + harder
     dp = (q[i] - flow[i]) / stiff
     direction = over[i] / q[i, None]
-    # 1 - 3 mu dp / q without the difference of equals
+    # 1 - 3 mu dp / q without cancellation
     kept = (flow[i] + harder * dp) / q[i]
     peeq[i] += dp
     plastic_strain[i] += 1.5 * dp[:, None] * direction
@@ -92,16 +92,16 @@ def radial_return(
 def plane_stress_return(
     strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array, yield_stress: Array, hardening: Array, modulus: Array
 ) -> Returned:
-    """Return within the plane of stress (Simo and Taylor, Int. J. Numer. Meth. Engng 22 (1986) 649-670).
+    """Return in plane stress (Simo and Taylor, Int. J. Numer. Meth. Engng 22 (1986) 649-670).
 
-    Elasticity, back stress and yield surface share the eigenmodes s11 + s22, s11 - s22 and s12. What they have beyond the back stress
-    shrinks by 1 / (1 + (r + k) x) and 1 / (1 + (1 + k) x) with r = (1 + nu) / (1 - nu) / 3 and k = modulus / (3 mu); x is the consistency
-    parameter times 2 mu and the root of
+    Elasticity, back stress and yield surface have the eigenmodes s11 + s22, s11 - s22 and s12. Differences from the back stress are
+    multiplied by 1 / (1 + (r + k) x) and 1 / (1 + (1 + k) x) with r = (1 + nu) / (1 - nu) / 3 and k = modulus / (3 mu); x is the
+    consistency parameter times 2 mu and the root of
 
         h(x) = flow / q(x) + 2 H x / (6 mu) - 1.
 
-    1 / q is the harmonic-like mean ``(y1^-2 + y2^-2)^(-1/2)`` of linear functions of x, so h is concave and grows: Newton's method
-    from x = 0 approaches the root from the left and needs no other safeguard. Arguments are those of ``radial_return``, vectors with 3
+    1 / q is the harmonic-like mean ``(y1^-2 + y2^-2)^(-1/2)`` of linear functions of x, so h is concave and increasing: Newton's method
+    from x = 0 approaches the root from the left and needs no safeguard. Arguments as in ``radial_return``, with vectors of 3
     components, and Young's modulus and Poisson's ratio ``(n,)`` in place of mu.
     """
     shear, area = E / (1 + nu), E / (1 - nu)
@@ -147,7 +147,7 @@ MODES = np.array([[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 0.5**0.5]]) * 2*
 
 
 def _squares(v: Array) -> Array:
-    """Of the size of vectors ``(n, k)``."""
+    """Squared norms of vectors ``(n, k)``."""
     return np.asarray(np.einsum("nk,nk->n", v, v), dtype=np.float64)
 
 

@@ -1,7 +1,7 @@
-"""Derivatives of the return onto the von Mises yield surface by all that it begins with, backwards and in closed form.
+"""Derivatives of the return to the von Mises yield surface by its initial values, in reverse mode and in closed form.
 
-Something counts the stress s, the plastic strain and peeq after a return by derivatives ``(n, k)``, ``(n, k)`` and ``(n,)``; what it counts
-strain, history and parameters by follows. Which points flow is kept.
+Given the derivatives of a functional by stress s, plastic strain and peeq after a return, ``(n, k)``, ``(n, k)`` and ``(n,)``, its
+derivatives by strain, history and parameters follow. Yielding points are kept.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from uem_dolfinx.materials.return_mapping import MODES, ON_SURFACE, plane_mises,
 
 @dataclass(frozen=True)
 class ByReturn:
-    """Derivatives by what a return begins with, at n points.
+    """Derivatives by the initial values of a return, at n points.
 
     Attributes:
-        strain, plastic_strain: ``(n, k)``, the latter the committed one.
+        strain, plastic_strain: ``(n, k)``, with the committed plastic strain.
         peeq: committed ``(n,)``.
         shear, area: by the logarithms of E / (1 + nu), and in plane stress of E / (1 - nu) ``(n,)``.
         yield_stress, hardening: ``(n,)``.
@@ -38,9 +38,9 @@ def radial_back(
     strain: Array, plastic_strain: Array, peeq: Array, mu: Array, yield_stress: Array, hardening: Array,
     by_stress: Array, by_plastic_strain: Array, by_peeq: Array,
 ) -> ByReturn:  # fmt: skip
-    """Of ``radial_return``, whose arguments come first.
+    """Derivatives of ``radial_return``, whose arguments come first.
 
-    With the trial deviator t, ``q = |t| sqrt(3/2)``, ``N = t / q`` and ``dp = (q - flow) / (3 mu + H)`` a point that flows has
+    With the trial deviator t, ``q = |t| sqrt(3/2)``, ``N = t / q`` and ``dp = (q - flow) / (3 mu + H)`` a yielding point has
 
         s = t - 3 mu dp N,    E_p + 3/2 dp N,    peeq + dp
     """

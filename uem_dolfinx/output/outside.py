@@ -1,4 +1,4 @@
-"""The outside of the undeformed bodies, by the vertices of this rank, and what is gathered of it for drawing."""
+"""The surface of the undeformed bodies, by the vertices of this rank, and its gathering for drawings."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 class Outside:
-    """Vertices, and facets on the outside (making one is collective).
+    """Vertices and exterior facets (the constructor is collective).
 
     Args:
-        problem: the scene.
+        problem: the problem.
 
     Attributes:
-        X: places of the d.o.f. of the mesh's P1 space ``(n_local, gdim)``.
-        owned: which of them this rank owns ``(n_local,)``.
-        faces: these around each owned facet on the outside ``(m, k)``.
+        X: positions of the d.o.f. of the mesh's P1 space ``(n_local, gdim)``.
+        owned: mask of owned ones ``(n_local,)``.
+        faces: d.o.f. around each owned exterior facet ``(m, k)``.
         cells: the cells behind them ``(m,)``.
         normals: outward unit normals at vertices, zero inside ``(n_local, gdim)``.
     """
@@ -43,7 +43,7 @@ class Outside:
         return None if parts is None else [np.concatenate(column) for column in zip(*parts)]
 
     def facets(self, which: Any = slice(None), part: Part | None = None) -> tuple[Array, Array]:
-        """Corners ``(m, k, gdim)`` and outward normals ``(m, gdim)`` of owned facets outside, some or those of a part (collective)."""
+        """Corners ``(m, k, gdim)`` and outward normals ``(m, gdim)`` of owned exterior facets, some or of a part (collective)."""
         faces, cells = (self.faces, self.cells) if part is None else boundary_and_cells(self.mesh, part)
         vectors = _area_vectors(self.X, faces[which], compat.cell_dofs(compat.function_space(self.mesh, 1))[cells[which]])
         return self.X[faces[which]], vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -61,7 +61,7 @@ class Outside:
         return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
 
     def at_vertices(self, values: Array) -> Array:
-        """Values at nodes ``(n_local, k)`` as those of vertices ``(n_local of P1, k)`` (collective)."""
+        """Values at vertices ``(n_local of P1, k)``, from values at nodes ``(n_local, k)`` (collective)."""
         config, shape = self.config, (values.shape[1],) if values.shape[1] > 1 else ()
         field = fem.Function(compat.function_space(self.mesh, config.degree, shape))
         linear = fem.Function(compat.function_space(self.mesh, 1, shape))
@@ -71,7 +71,7 @@ class Outside:
         return np.array(linear.x.array.reshape(-1, values.shape[1]))
 
     def touched(self, which: Bools) -> Bools:
-        """Vertices of some of the owned facets, also of other ranks' ``(n_local,)`` (collective)."""
+        """Mask of vertices ``(n_local,)`` of owned facets in a mask, including facets of other ranks (collective)."""
         field = fem.Function(compat.function_space(self.mesh, 1))
         field.x.array[self.faces[which].ravel()] = 1.0
         forms.sum_ghosts(field)
@@ -85,7 +85,7 @@ class Outside:
 
 
 def _area_vectors(X: Array, faces: Ints, behind: Indices) -> Array:
-    """Outward normals of facets, as long as these are large ``(m, gdim)``; ``behind`` are vertices of the cells behind them."""
+    """Outward normals of facets, proportional to their areas ``(m, gdim)``; ``behind`` are vertices of the cells behind them."""
     corners = X[faces]
     a = corners[:, 1] - corners[:, 0]
     n = np.column_stack([a[:, 1], -a[:, 0]]) if X.shape[1] == 2 else np.cross(a, corners[:, 2] - corners[:, 0])

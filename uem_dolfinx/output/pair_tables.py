@@ -10,15 +10,15 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 class PairTables(Closing):
-    """CSV files beside a history, ``NAME_pairs.csv``, one for each general contact (collective).
+    """CSV files next to a history, ``NAME_pairs.csv``, one for each general contact (collective).
 
-    Columns: ``factor`` or ``time``, ``step``, the names ``first`` and ``second`` of bodies that touch, or of a body and a rigid surface,
-    the number ``active`` of contactors, and ``force_x`` ... on the first with its ``moment`` about the origin. Steps in which nothing
-    touches have no rows.
+    Columns: ``factor`` or ``time``, ``step``, the names ``first`` and ``second`` of bodies in contact, or of a body and a rigid surface,
+    the number ``active`` of contactors, and ``force_x`` ... on the first with its ``moment`` about the origin. Steps without contact
+    have no rows.
 
     Args:
         path: of the history.
-        problem: what the rows are read from.
+        problem: source of the rows.
         suffixes: of all its declared contacts.
         clock: name of the first column.
         resultant: names of the columns of forces and moments.

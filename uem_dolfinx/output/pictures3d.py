@@ -91,7 +91,7 @@ def images(faces: Ints, solids: Sequence[Solid], look: Look) -> list[Array]:
     Args:
         faces: vertices in their order around each facet ``(n, 3 or 4)``.
         solids: the states.
-        look: what they have in common.
+        look: their common options.
 
     Returns:
         Images ``(height, width, 4)``, with their margins cut off.

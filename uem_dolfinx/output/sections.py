@@ -58,7 +58,7 @@ def sections(x: Array, values: Array, cells: dict[int, Ints], planes: Sequence[t
     Args:
         x: their vertices ``(n, 3)``.
         values: a field there ``(n,)``.
-        cells: as of ``solid_cells``.
+        cells: as returned by ``solid_cells``.
         planes: axis and bound of each.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Contact surfaces alone over time, where they are, with what they carry: VTK's unstructured grids, which ParaView and meshio read."""
+"""Time series of deformed contact surfaces with their fields: VTK's unstructured grids, for ParaView and meshio."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ VTK_TYPES = {
 
 
 class SurfaceWriter(Closing, given.Sealed):
-    """Time series of the contactors' surfaces alone, on which pressures are seen from all sides.
+    """Time series of the contactors' surfaces only, so that pressures are visible from all sides.
 
-    Writes ``PATH.pvd``, complete after every step, which names the files ``PATH_surfaces/STEP_CONTACT_RANK.vtu`` that every rank writes of
-    its own facets, if it has any: at their nodes, where these are now, displacement, pressure, gap, status and force of the contact.
-    Files that are there are moved aside as those of ``ResultsWriter``::
+    Writes ``PATH.pvd``, complete after every step, which lists the files ``PATH_surfaces/STEP_CONTACT_RANK.vtu`` that every rank writes of
+    its own facets, if it has any: displacement, pressure, gap, status and force of the contact at the deformed nodes.
+    Existing files are moved to a folder as in ``ResultsWriter``::
 
         with uem.SurfaceWriter("out/run", problem) as writer:
             for step in uem.load_steps(problem, 20):
@@ -40,10 +40,10 @@ class SurfaceWriter(Closing, given.Sealed):
 
     Args:
         path: name of the files without ending; its folder is made.
-        problem: whose contacts are written.
+        problem: problem whose contacts are written.
 
     Raises:
-        InputError, InputTypeError: for no path, no problem, or one without contacts.
+        InputError, InputTypeError: for an invalid path or problem, or a problem without contacts.
         MissingBackendError: without PyVista.
         OutputError: if the files cannot be written.
     """

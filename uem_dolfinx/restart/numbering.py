@@ -1,4 +1,4 @@
-"""The order of a mesh's input, in which checkpoints are written and read, since partitions differ from run to run."""
+"""The input order of a mesh, in which checkpoints are written and read, since partitions differ between runs."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ DIGEST = 16
 
 
 class Numbering:
-    """Places of this rank's rows in a table over all ranks, in the order of keys that no partition changes (making one is collective).
+    """Positions of this rank's rows in a table of all ranks, in the order of partition-independent keys (the constructor is collective).
 
-    ``keys (n,)`` are those of this rank's rows, each different from all others on all ranks and below ``bound``.
+    ``keys (n,)`` of this rank's rows are unique on all ranks and below ``bound``.
 
     Attributes:
         place: of each row in the table ``(n,)``.
@@ -58,13 +58,13 @@ class Numbering:
         (self._received,) = self._exchange.send(self.place - bounds[holder])
 
     def to_table(self, rows: AnyArray) -> AnyArray:
-        """This rank's part of the table ``(count, ...)`` from everybody's rows ``(n, ...)`` (collective)."""
+        """This rank's part of the table ``(count, ...)`` from the rows ``(n, ...)`` of all ranks (collective)."""
         part = np.empty((self.count, *rows.shape[1:]), dtype=rows.dtype)
         (part[self._received],) = self._exchange.send(rows)
         return part
 
     def from_table(self, part: AnyArray) -> AnyArray:
-        """This rank's rows ``(n, ...)`` from everybody's parts of the table ``(count, ...)`` (collective)."""
+        """This rank's rows ``(n, ...)`` from the parts ``(count, ...)`` of the table on all ranks (collective)."""
         rows = np.empty((len(self.place), *part.shape[1:]), dtype=part.dtype)
         (rows[self._exchange.rows],) = self._exchange.back(part[self._received])
         return rows
@@ -76,11 +76,11 @@ def n_cells(mesh: Any) -> int:
 
 
 def node_numbering(V: Any) -> Numbering:
-    """Numbering of a space's owned nodes (blocks of d.o.f.), by the first cell of the input that has them (collective).
+    """Numbering of a space's owned nodes (blocks of d.o.f.), by their first cell in the input (collective).
 
-    A cell keeps the order of its vertices in every partition, and with it that of its nodes as long as no edge and no facet has
-    more than one of its own: their order would follow global numbers of vertices. So Lagrange of degree
-    1 or 2, discontinuous Lagrange and quadrature spaces alone, with values of any shape; a CheckpointError refuses others.
+    The order of a cell's vertices is the same in every partition, and so is the order of its nodes if edges and facets have at most one
+    inner node each; otherwise it depends on global numbers of vertices. So only Lagrange spaces of degree 1 or 2, discontinuous Lagrange
+    and quadrature spaces are supported, with values of any shape; others raise a CheckpointError.
     """
     comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, compat.cell_dofs(V)
     found, error = compat.element_family(V), None
@@ -93,7 +93,7 @@ def node_numbering(V: Any) -> Numbering:
     owned, k = index_map.size_local, V.dofmap.dof_layout.num_dofs
     keys = np.full(owned + index_map.num_ghosts, np.iinfo(np.int64).max)
     np.minimum.at(keys, cells, forms.original_cells(V.mesh)[:, None] * k + np.arange(cells.shape[1]))
-    # the first cell may be one that the node's owner does not know
+    # the first cell may not exist on the rank that owns the node
     starts = np.array(comm.allgather(index_map.local_range[0]))
     ghosts = index_map.local_to_global(np.arange(owned, len(keys), dtype=np.int32)).astype(np.int64)
     owner = np.searchsorted(starts, ghosts, side="right") - 1

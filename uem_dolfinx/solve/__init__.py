@@ -1,1 +1,1 @@
-"""The united Newton loop, and problems led through load steps and time steps."""
+"""The united Newton loop, and problems solved in load steps and time steps."""

@@ -1,4 +1,4 @@
-"""Natural frequencies of bodies in the state of contact that they are in: ``P'KP q = omega^2 P'MP q``, by SLEPc."""
+"""Natural frequencies of bodies with the present contact: ``P'KP q = omega^2 P'MP q``, by SLEPc."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Vibrations:
     """Natural vibrations about an equilibrium.
 
     Attributes:
-        frequencies: in cycles per unit of time, ascending ``(n,)``; negative where a motion grows instead, as the equilibrium is unstable.
+        frequencies: in cycles per unit of time, ascending ``(n,)``; negative for growing motions of an unstable equilibrium.
         eigenvalues: squares of the circular frequencies ``(n,)``.
-        functions: displacements of the modes, with ``v'Mv = 1``, and all other fields that go with them; their signs are arbitrary.
+        functions: displacements of the modes, with ``v'Mv = 1``, and the corresponding other fields; their signs are arbitrary.
     """
 
     frequencies: Array
@@ -48,22 +48,22 @@ class Vibrations:
 def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vibrations:
     """The lowest natural frequencies of small vibrations about the present equilibrium, with the present contact (collective).
 
-    Contactors that touch stay united to their targets, those that stick in all directions, those that slip along the normal alone, without
-    friction; the others are free. Forces of the contact and of the bodies stiffen or soften as in the tangent of Newton's method; damping
-    is left out. Other fields have no inertia, and follow the displacement as their equations say.
+    Active contactors follow their targets: sticking ones in all directions, slipping ones along the normal only, without friction. Other
+    contactors are free. Geometric stiffness of contact and bodies is included as in Newton's tangent; damping is neglected. Other fields
+    have no inertia, and follow the displacement by their equations.
 
         frequencies = uem.modes(problem, 4, mass=uem.consistent_mass(V, rho)).frequencies
 
     Args:
         problem: in equilibrium.
         n: number of modes.
-        mass: of the bodies, beside which masses at points of rigid couplings count; None takes that of the problem's dynamics.
+        mass: of the bodies, in addition to masses at points of rigid couplings; None takes the mass of the problem's dynamics.
 
     Raises:
         MissingBackendError: without slepc4py.
-        InputError, InputTypeError, SpaceError: if there is no mass, or it is of another space, for a tangent that is not symmetric, or
-            for more modes than components with mass.
-        LinearSolveError: if SLEPc does not find them.
+        InputError, InputTypeError, SpaceError: if the mass is missing or of another space, if the tangent is not symmetric, or if n
+            exceeds the number of components with mass.
+        LinearSolveError: if SLEPc does not converge.
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     config, bodies, system = problem.config, problem.bodies, problem.system
@@ -88,7 +88,7 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
     with nullcontext() if problem.dynamics is None else problem.dynamics.without_inertia():
         bodies.assemble()
         bodies.tangent.update()
-        # bodies that float are to be free
+        # no supports: floating bodies are free
         rows = make_rows(
             system.over_constraints,
             pairs := in_question(system.pairs),
@@ -133,7 +133,7 @@ def _solve(slepc: Any, problem: UnitedProblem, P: Restriction, A: PETSc.Mat, B: 
         raise InputError(f"n = {n}: expected no more than {moving} modes, the number of free components with mass")
     # in the displacement's rows, which come first
     largest = problem.config.vector(stiffness.array_r[: problem.config.n_owned * problem.config.gdim]).norm() / inertia.norm()
-    # idle components vibrate infinitely fast
+    # idle components get infinite frequencies
     stiffness.array[~used] = stiffness.max()[1]
     A.setDiagonal(stiffness)
     if not is_symmetric(A, problem.config.unknowns):
@@ -147,7 +147,7 @@ def _solve(slepc: Any, problem: UnitedProblem, P: Restriction, A: PETSc.Mat, B: 
     eps.setDimensions(n)
     eps.setTolerances(EIGENVALUE)
     eps.setWhichEigenpairs(slepc.EPS.Which.TARGET_MAGNITUDE)
-    # below zero, so that bodies that float leave nothing singular: half of all digits from rounding, half from the largest eigenvalue
+    # below zero, so that the shifted matrix of floating bodies is regular: halfway, in digits, between rounding and the largest eigenvalue
     eps.setTarget(-np.sqrt(np.finfo(float).eps) * largest)
     transform = eps.getST()
     transform.setType("sinvert")

@@ -57,7 +57,7 @@ class Bodies:
         unknowns: rows of vectors and matrices; the nodes, unless there are other fields.
         held: unknowns with a Dirichlet condition, ghosts included ``(n,)``.
         free: components of the displacement without Dirichlet condition ``(n_local, gdim)``.
-        free_rows: likewise of all unknowns, in the rows of vectors ``(n_rows, gdim)``.
+        free_rows: all unknowns without Dirichlet condition, in the rows of vectors ``(n_rows, gdim)``.
         dead: forces of fixed direction at all unknowns, such as forces of removed conditions, ghosts included ``(n,)``; None for zero.
         wanted: prescribed values at the unknowns with Dirichlet conditions, ghosts included ``(n,)``.
         tangent: K.

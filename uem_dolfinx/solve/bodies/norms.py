@@ -1,4 +1,4 @@
-"""Norms of forces as the Newton loop compares them: one of a displacement's, or one for each field, since a force is not a heat."""
+"""Norms of forces in the Newton loop: one for a displacement, or one for each field of a mixed problem, because of their units."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array
 
-#: A norm of forces; where the displacement is one of several fields, one for each of them, its own first ``(n_fields,)``.
+#: A norm of forces; in mixed problems one for each field, with the displacement's first ``(n_fields,)``.
 Norm: TypeAlias = float | Array
 #: A residual that has grown in so many iterations, one after the other, does not come back: what touches or is nearly turned inside out
 #: may make as large a one at once, which falls from then on.
@@ -27,18 +27,18 @@ def first(norm: Norm) -> float:
 
 
 def ratio(norm: Norm, scale: Norm) -> float:
-    """A norm over a scale, in the field where it is largest; 0 where there is no scale."""
+    """The largest ratio of a norm to a scale over all fields; 0 for a zero scale."""
     return float(np.max(np.divide(norm, scale, out=np.zeros(np.shape(norm)), where=np.asarray(scale) > 0)))
 
 
 def worst(norm: Norm, rounding: Norm, real: Norm) -> tuple[float, float, float]:
-    """Residual, rounding and forces of the field in which the residual is the largest part of the forces."""
+    """Residual, rounding and forces of the field with the largest residual relative to its forces."""
     every = [np.atleast_1d(a) for a in np.broadcast_arrays(norm, rounding, real)]
     k = int(np.argmax(every[0] / np.where(every[2] > 0.0, every[2], np.inf)))
     return float(every[0][k]), float(every[1][k]), float(every[2][k])
 
 
 def runs_away(residuals: Sequence[float]) -> bool:
-    """Whether relative residuals of one iteration after the other have grown without end."""
+    """Whether relative residuals of successive iterations diverge."""
     last = residuals[-RUNNING_AWAY - 1 :]
     return len(last) > RUNNING_AWAY and last[-1] > FAR_AWAY and all(a < b for a, b in pairwise(last))

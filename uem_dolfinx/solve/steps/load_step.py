@@ -1,4 +1,4 @@
-"""What is told of a converged load step."""
+"""Data of a converged load step."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class LoadStep(ConvergedStep):
         number: counted from 1.
         factor: load factor reached, 1 at the end.
         iterations: history of the Newton loop.
-        cuts: how often the step had to be shortened.
-        step: name of the ``Step`` that it is of; empty without.
-        before: number of ``Step`` before that.
+        cuts: number of times that the step was shortened.
+        step: name of its ``Step``, or empty.
+        before: number of ``Step`` before it.
     """
 
     number: int
@@ -30,9 +30,9 @@ class LoadStep(ConvergedStep):
 
     @property
     def time(self) -> float:
-        """Number of ``Step`` that are done and the load factor in the present one, which grows from step to step."""
+        """Number of completed ``Step`` plus the load factor in the present one, which increases from step to step."""
         return self.before + self.factor
 
     def __str__(self) -> str:
-        """Which step it is, and its load factor."""
+        """Its number and load factor."""
         return f"{f'{self.step}, ' if self.step else ''}load step {self.number}, factor {self.factor:.6g}"
