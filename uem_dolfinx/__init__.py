@@ -11,19 +11,19 @@
     for step in uem.load_steps(problem, 5):
         print(step, contact.resultant().force)
 
-``help(uem.Contact)`` and ``help(uem.UnitedProblem)`` say what a scene can have, ``help(uem.load_steps)`` and ``help(uem.time_steps)`` how
-it is solved, ``help(uem.ResultsWriter)`` and ``help(uem.plot_scene)`` what is written.
+``help(uem.Contact)`` and ``help(uem.UnitedProblem)`` describe the model, ``help(uem.load_steps)`` and ``help(uem.time_steps)`` its
+solution, ``help(uem.ResultsWriter)`` and ``help(uem.plot_scene)`` the output.
 
     du = P dq + c,    P'KP dq = P'(r - K c)
 
-The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, and the modules that take them:
+The steps of [UEM, 4], repeated until equilibrium and contact conditions hold, and their modules:
 
 1. Unite: the normal displacement of each active contactor follows the target: ``contact.nodes.node_to_surface`` and
    ``contact.nodes.bernstein``, or ``contact.mortar.placement``, write the equations, ``algebra.restriction`` builds P and c from them.
-2. Solve the united system (``algebra.linear_solver``); once forces are in equilibrium, return each contactor along the normal onto the
-   moved target (``contact.pair.interface``, with projections from ``geometry``).
-3. Pass the contactor's normal force on to the target: ``P'r`` in ``solve.united.system``.
-4. Activate contactors that have gone through, release those that pull (``contact.seam.active_set``), iterate (``solve.united.newton``).
+2. Solve the constrained system (``algebra.linear_solver``); once forces are in equilibrium, return each contactor along the normal onto
+   the moved target (``contact.pair.interface``, with projections from ``geometry``).
+3. Transfer the contactor's normal force to the target: ``P'r`` in ``solve.united.system``.
+4. Activate penetrating contactors, release contactors in tension (``contact.seam.active_set``), iterate (``solve.united.newton``).
 
 [UEM]: K. Farahani, M. Mofid, A. Vafai: United elements method for general contact-impact problems. Computer Methods in Applied
 Mechanics and Engineering 191 (2001) 843-860.

@@ -14,7 +14,7 @@ from uem_dolfinx.parallel import Exchange
 
 
 class Blocks(NamedTuple):
-    """Blocks of a sparse matrix; those at one place add up.
+    """Blocks of a sparse matrix; blocks with the same row and column are summed.
 
     Attributes:
         row: global node of each block's components ``(k,)``.
@@ -27,7 +27,7 @@ class Blocks(NamedTuple):
     value: Array
 
     def some(self, which: Any) -> Blocks:
-        """Those alone that a mask or indices name."""
+        """The blocks selected by a mask or indices."""
         return Blocks(self.row[which], self.column[which], self.value[which])
 
     @property
@@ -42,7 +42,7 @@ def together(*parts: Blocks) -> Blocks:
 
 
 def product(A: Blocks, B: Blocks) -> Blocks:
-    """``A B`` with each place once, zeros stored; columns of A of which B has no row count as zero."""
+    """``A B`` without duplicates, zeros stored; columns of A without a row in B count as zero."""
     from scipy.sparse import bsr_matrix
 
     g = A.value.shape[1]
@@ -53,7 +53,7 @@ def product(A: Blocks, B: Blocks) -> Blocks:
     columns, of_column = np.unique(B.column, return_inverse=True)
     if not len(rows):
         return Blocks(rows, rows, np.zeros((0, g, g)))
-    # SciPy drops zeros where blocks are single numbers, in which places would depend on values
+    # for blocks of single numbers SciPy drops zeros, so that the sparsity would depend on values
     wide = np.zeros((len(B.row), g, max(g, 2)))
     wide[:, :, :g] = B.value
     left = _in_rows(of_row, at[kept], A.value[kept], len(rows))
@@ -65,13 +65,13 @@ def product(A: Blocks, B: Blocks) -> Blocks:
 
 
 def _in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array, Ints, Ints]:
-    """Blocks in the order of their rows, their columns, and the first of each row and their number."""
+    """Blocks in the order of their rows, their columns, and the start of each row."""
     order = np.argsort(row, kind="stable")
     return value[order], column[order], np.append(0, np.cumsum(np.bincount(row, minlength=n_rows)))
 
 
 def summed(A: Blocks) -> Blocks:
-    """The same matrix with each place once, sorted by row and column."""
+    """The same matrix without duplicates, sorted by row and column."""
     order = np.lexsort((A.column, A.row))
     row, column = A.row[order], A.column[order]
     new = np.ones(len(row), dtype=bool)
@@ -80,14 +80,14 @@ def summed(A: Blocks) -> Blocks:
 
 
 def to_owners(space: Nodes, A: Blocks) -> Blocks:
-    """The blocks of all ranks in rows that this rank owns (collective)."""
+    """Blocks of all ranks in rows that this rank owns (collective)."""
     if space.comm.size == 1:
         return A
     return Blocks(*Exchange.to(space.comm, space.owner_of(A.row)).send(*A))
 
 
 def rows_at(space: Nodes, A: Blocks, nodes: Ints) -> Blocks:
-    """Rows of A, whose rows their owners have, at global ``nodes (m,)`` of any rank, each once (collective)."""
+    """Rows of A, stored on their owners, at distinct global ``nodes (m,)`` of any rank (collective)."""
     asking = Exchange.to(space.comm, space.owner_of(nodes))
     (asked,) = asking.send(nodes)
     order = np.argsort(A.row, kind="stable")

@@ -1,4 +1,4 @@
-"""Sparse matrices whose entries NumPy sees where PETSc keeps them."""
+"""Sparse matrices with entries in arrays shared by NumPy and PETSc."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SYMMETRIC = 1e-11
 class Entries:
     """Entries of the owned rows of a square matrix, shared with PETSc.
 
-    Those in own columns come first, row by row; on several ranks those in other ranks' columns follow, of row ``i`` in line ``n + i``.
+    Entries in own columns come first, row by row; on several ranks entries in other ranks' columns follow, row ``i`` in line ``n + i``.
 
     Args:
         indptr: first entry of every line, and the number of entries ``(lines + 1,)``; lines are the n owned rows, or twice as many.
@@ -69,7 +69,7 @@ class Entries:
         return Entries.of_arrays(lines, np.append(columns[own], columns[~own]), np.zeros(len(columns)), K)
 
     def find(self, lines: Ints, columns: Ints) -> tuple[Ints, Bools]:
-        """Places where entries of these lines and columns are or would be put, and whether they are there, ``(m,)`` each."""
+        """Positions of entries of these lines and columns, or of their insertion, and whether they exist, ``(m,)`` each."""
         low, high = self.indptr[lines], self.indptr[lines + 1]
         end = high
         # all lines are bisected at once
@@ -83,7 +83,7 @@ class Entries:
 
 
 def entries_of(which: Ints, starts: Ints) -> tuple[Ints, Ints]:
-    """Places of the entries of some lines, one line after the other, and which of ``which (k,)`` each is of.
+    """Positions of the entries of some lines, one line after the other, and the index in ``which (k,)`` of each entry's line.
 
     ``starts`` are the first entry of every line and the number of entries.
     """

@@ -87,8 +87,8 @@ class Progress:
         of_equations: multipliers of equations of users at their eliminated components, from a checkpoint ``(n_local, gdim)``.
         taken: shares of the committed state, see ``solve.taken``.
         began: shares at the beginning of the call.
-        left: load factors at which lists of several ``Step`` were left before their end, by the number of the call of each step that
-            was left or skipped.
+        left: load factors at which lists of several ``Step`` were left before their end, by the number of the call that the ``Step``
+            counts as.
         number: identifies the problem in this script; its steps have it as ``_of_problem``.
     """
 
