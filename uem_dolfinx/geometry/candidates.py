@@ -1,4 +1,4 @@
-"""Which facets can be nearest to points, and which balls about both can meet: trees over facets' middles. Pure geometry, on one rank."""
+"""Candidates for nearest facets, and pairs of intersecting balls, by trees over facet midpoints. Pure geometry, on one rank."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALL_PAIRS = 2**15
 def candidate_pairs(
     shape: FacetShape, x: Array, points: Array, asked: Ints | None = None, surface: Ints | None = None
 ) -> tuple[Ints, Ints]:
-    """Indices ``(k,)`` of points and of facets that can be closest, of many from trees over the facets' middles, one per size class.
+    """Indices ``(k,)`` of points and of facets that can be closest; with many facets by one tree of midpoints per size class.
 
     A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
     into classes of like radius keeps a graded mesh from paying for its largest facet everywhere. Every one of the
@@ -37,7 +37,7 @@ def candidate_pairs(
     bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
     places, middles = points, middle
     if asked is not None and surface is not None:
-        # a further axis, along which surfaces are farther from each other than all that is near
+        # a further axis, along which different surfaces are too far from each other to be near
         far = 4.0 * float(np.ptp(np.concatenate([points, middle]), axis=0).sum() + radius.max())
         places, middles = np.column_stack([points, far * asked]), np.column_stack([middle, far * surface])
     if len(places) * len(middles) <= ALL_PAIRS:
@@ -49,7 +49,7 @@ def candidate_pairs(
 
         bound = cKDTree(middles).query(places)[0] * (1 + EQUALLY_NEAR)
         i, f = balls_that_meet(places, bound, middles, radius)
-    # a facet lies in a disc about its middle, as thick as it bulges: from a distance many middles are near, few discs
+    # a facet lies in a flat disc about its midpoint; from a distance, fewer discs than balls are near
     away = points[i] - middle[f]
     height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
     beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
@@ -58,14 +58,14 @@ def candidate_pairs(
 
 
 def balls_that_meet(points: Array, within: Array, middle: Array, radius: Array) -> tuple[Ints, Ints]:
-    """Pairs ``(k,)`` of balls about ``points (n, gdim)`` and about facets' middles ``(m, gdim)``, m > 0, that may meet.
+    """Pairs ``(k,)`` of balls about ``points (n, gdim)`` and about facet midpoints ``(m, gdim)``, m > 0, that may intersect.
 
-    There is a tree for each class of balls of like radius on either side.
+    There is a tree for each class of balls of similar radius on either side.
 
     Args:
-        points: middles of the first.
+        points: centres of the first balls.
         within: their radii ``(n,)``.
-        middle: of the facets.
+        middle: midpoints of the facets.
         radius: of the facets ``(m,)``.
     """
     from scipy.spatial import cKDTree

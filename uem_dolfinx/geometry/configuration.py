@@ -1,4 +1,4 @@
-"""Nodes of a displacement and where they are now."""
+"""Nodes of a displacement and their current positions."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from uem_dolfinx.parallel import reduced
 
 
 class Configuration(Nodes):
-    """Nodes of a vector Lagrange space and where they are now: ``x = X + u``.
+    """Nodes of a vector Lagrange space and their current positions ``x = X + u``.
 
     Raises:
         SpaceError: if ``u`` is not in a blocked Lagrange space of degree 1 or 2 with one component per coordinate.
     """
 
-    #: Whether nodes are where the unknowns take them; a scalar field takes them nowhere.
+    #: Whether the unknowns move the nodes; a scalar field does not.
     moves = True
-    #: What results and checkpoints call what is solved for.
+    #: Name of the solution in results and checkpoints.
     name = "displacement"
 
     def __init__(self, u: fem.Function):
-        #: The Function with all unknowns, and the displacement in UFL; one and the same unless there are other fields.
+        #: The Function with all unknowns, and the displacement in UFL; identical without other fields.
         self.whole: fem.Function = u
         self.u: Any = u
         self._take(u.function_space)
 
     def _take(self, V: Any) -> None:
-        """Take the nodes of the displacement's space (collective)."""
+        """Set the nodes of the displacement's space (collective)."""
         gdim = V.mesh.geometry.dim
         self.tdim: int = V.mesh.topology.dim
         degree = compat.lagrange_degree(V)
@@ -59,22 +59,22 @@ class Configuration(Nodes):
         if degree > 2:
             raise SpaceError(f"contact surfaces of degree {degree} are not supported: use degree 1 or 2")
         super().__init__(V)
-        #: Facets of surfaces that several share while they have them, by ``id`` of their tags; see ``facets.facets_of``.
+        #: Shared facets of surfaces while they are in use, by ``id`` of their tags; see ``facets.facets_of``.
         self.surfaces: WeakValueDictionary[int, Any] = WeakValueDictionary()
-        #: Whether the coordinates are radius and height, and nodes stand for circles.
+        #: Whether the coordinates are radius and height, and nodes represent circles.
         self.axisymmetric: bool = is_axisymmetric(V.mesh)
 
     @property
     def unknowns(self) -> Any:
-        """The nodes that vectors and matrices have rows for: these."""
+        """The nodes with rows in vectors and matrices: all of these."""
         return self
 
     def of(self, values: AnyArray) -> Any:
-        """Values of the displacement ``(n_local, gdim)`` among those of all unknowns, ghosts included ``(n,)`` (a view)."""
+        """Values of the displacement ``(n_local, gdim)`` from values of all unknowns including ghosts ``(n,)`` (a view)."""
         return values.reshape(-1, self.block)
 
     def numbers_as(self, V: Any) -> bool:
-        """Whether vectors of another space are those of the displacement's: of the same mesh and numbering, on this rank."""
+        """Whether another space has the same mesh and numbering as the displacement's, on this rank."""
         return compat.is_on(V, self.mesh) and np.array_equal(compat.cell_dofs(V), compat.cell_dofs(self.V))
 
     def rows(self, values: AnyArray) -> Any:
@@ -82,32 +82,32 @@ class Configuration(Nodes):
         return values.reshape(-1, self.block)
 
     def from_rows(self, rows: Array) -> Array:
-        """Owned values of all unknowns ``(n,)`` of a vector's ``rows (n_rows * gdim,)``."""
+        """Owned values of all unknowns ``(n,)`` from a vector's ``rows (n_rows * gdim,)``."""
         return rows
 
     def add_to(self, values: AnyArray, of_nodes: Array) -> None:
-        """Add what the owned nodes of the displacement have ``(n_owned * gdim,)`` to owned values of all unknowns ``(n,)``."""
+        """Add values at the owned nodes of the displacement ``(n_owned * gdim,)`` to owned values of all unknowns ``(n,)``."""
         values += of_nodes
 
     def in_rows(self, matrix: PETSc.Mat) -> PETSc.Mat:
-        """A matrix of the displacement with the rows and columns that vectors have, zero in those of other fields (collective)."""
+        """A matrix of the displacement extended to all rows and columns, with zeros for other fields (collective)."""
         return matrix
 
     def place_of(self, unknown: int) -> str:
-        """Which component of which node a local unknown is, for error messages."""
+        """Component and node of a local unknown, for error messages."""
         node, component = divmod(unknown, self.gdim)
         return f"{'xyz'[component]} at {self.describe(node)}"
 
     def functions(self) -> dict[str, fem.Function]:
-        """The displacement, and other fields, as Functions of spaces of their own by name, up to date (first call: collective)."""
+        """The displacement and other fields as separate, current Functions by name (first call: collective)."""
         return {self.name: self.whole}
 
     def fill(self, functions: Mapping[str, fem.Function], values: Array) -> None:
-        """Write values of all unknowns, ghosts included ``(n,)``, to Functions that are like those of ``functions``."""
+        """Write values of all unknowns including ghosts ``(n,)`` to Functions as in ``functions``."""
         functions[self.name].x.array[:] = values
 
     def values_of(self, functions: Mapping[str, fem.Function]) -> Array:
-        """Values of all unknowns, ghosts included ``(n,)``, from Functions that are like those of ``functions``."""
+        """Values of all unknowns including ghosts ``(n,)`` from Functions as in ``functions``."""
         return np.array(functions[self.name].x.array)
 
     @property
@@ -116,7 +116,7 @@ class Configuration(Nodes):
         return np.asarray(self.of(self.whole.x.array))
 
     def shift(self, nodes: Any, way: Array) -> None:
-        """Move local nodes ``(n,)``, each named once, or all of a slice, by a way ``(n, gdim)``; ghosts are not told."""
+        """Move distinct local nodes ``(n,)``, or a slice, by ``way (n, gdim)``; ghosts are not updated."""
         self.of(self.whole.x.array)[nodes] += way
 
     @property
@@ -126,7 +126,7 @@ class Configuration(Nodes):
 
     @contextmanager
     def at(self, displacement: Array) -> Iterator[None]:
-        """For a while, the nodes where other values of all unknowns take them, ghosts included ``(n,)``."""
+        """Context with other values of all unknowns including ghosts ``(n,)``."""
         u = self.whole.x.array
         kept = np.array(u)
         u[:] = displacement
@@ -139,7 +139,7 @@ class Configuration(Nodes):
         """Translations and linearised rotations of the current configuration at the owned nodes ``(n_owned, n_modes, gdim)``.
 
         Args:
-            centred: whether turns are to be about the middle of all nodes, and as large as shifts (collective if so).
+            centred: whether rotations are about the middle of all nodes, and scaled like translations (collective if so).
         """
         x = self.x[: self.n_owned]
         if centred:
@@ -147,7 +147,7 @@ class Configuration(Nodes):
         return rigid_velocities(x)
 
     def of_circles(self, vectors: Array) -> Array:
-        """Forces, momenta or places of nodes ``(..., gdim)`` as those of all that they stand for: around an axis radial parts cancel."""
+        """Forces, momenta or positions of nodes ``(..., gdim)``, integrated over circles in axisymmetry: radial parts cancel."""
         return vectors * np.array([0.0, 1.0]) if self.axisymmetric else vectors
 
     @cached_property
@@ -159,7 +159,7 @@ class Configuration(Nodes):
 
 
 def configuration_of(V: Any) -> Configuration:
-    """Nodes of a space of displacements; InputTypeError or SpaceError if it is none."""
+    """Nodes of a displacement space; InputTypeError or SpaceError for other spaces."""
     given.kind("V", V, isinstance(V, fem.FunctionSpace), "a function space", "as u.function_space")
     if len(V.component()):
         raise SpaceError("V is a part of another space: expected a whole one; collapse it, or make it by uem.function_space")

@@ -1,4 +1,4 @@
-"""Smooth faces of the surfaces of many bodies, in few classes: where edges are sharp, facets of different classes meet."""
+"""Smooth faces of the surfaces of many bodies, in classes such that faces at a sharp edge belong to different classes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uem_dolfinx.parallel import reduced
 
 
 def facets_by_class(skin: Skin, classes: Ints, count: int, which: Bools) -> list[Tag]:
-    """Some of this rank's facets ``(m,)`` as surfaces, one for each of so many ``classes (m,)`` that has any (collective)."""
+    """Surfaces of some of this rank's facets ``(m,)``, one for each nonempty class of ``classes (m,)`` (collective)."""
     some = reduced(skin.config.comm, np.bincount(classes[which], minlength=count)) > 0
     return [surface_of(skin, which & (classes == k)) for k in np.flatnonzero(some)]
 
@@ -29,9 +29,9 @@ def surface_of(skin: Skin, which: Bools) -> Tag:
 def classes_of_facets(skin: Skin) -> tuple[Ints, int]:
     """A class for each facet of this rank ``(m,)``, and the number of classes (collective).
 
-    Facets that meet at a smooth edge are of one class, those of two faces that meet at a sharp edge of two. The faces take the first
-    class that none beside them has, one by one in the order of what tells facets in any partition. Only the list of faces that meet at
-    sharp edges is known to all ranks. A face that goes round and meets itself at a sharp edge is of one class all the same.
+    Facets at a smooth edge belong to one class, two faces at a sharp edge to different classes. Faces get, one by one in the order
+    of facet keys, the first class that no neighbouring face has. Only the list of faces that meet at sharp edges is known to all
+    ranks. A face that meets itself at a sharp edge belongs to a single class nevertheless.
     """
     face, count = _faces(skin)
     first = np.full(count, np.iinfo(np.int64).max)
@@ -51,14 +51,14 @@ def classes_of_facets(skin: Skin) -> tuple[Ints, int]:
 
 
 def _faces(skin: Skin) -> tuple[Ints, int]:
-    """The smooth face of each facet of this rank ``(m,)``, alike on all ranks, and their number (collective)."""
+    """The smooth face of each facet of this rank ``(m,)``, numbered equally on all ranks, and their number (collective)."""
     n, begin = len(skin.dofs), skin.first[skin.config.comm.rank]
     facet, side = np.nonzero(~skin.edges.sharp & (skin.edges.across >= 0))
     other = skin.edges.across[facet, side]
     here = (other >= begin) & (other < begin + n)
 
     def shared(mine: Ints) -> Ints:
-        """What the ranks of facets across call the pieces of these."""
+        """Numbers of the pieces of neighbouring facets on their ranks."""
         return np.column_stack([mine[facet], skin.values_at(other, mine)])
 
     return connected(skin.config.comm, n, np.column_stack([facet[here], other[here] - begin]), shared)

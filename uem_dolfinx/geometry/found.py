@@ -1,4 +1,4 @@
-"""What is found in a mesh file of another program, before anything is made of it: nodes, cells of all kinds, sets and surfaces."""
+"""Content of a mesh file of another program: nodes, cells of all kinds, sets and surfaces."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from uem_dolfinx.arrays import Array, Ints
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of cells by its vertices, in VTK's order, after which come nodes of edges, of quadrilaterals, and one in the middle.
+    """A kind of cells, with nodes in VTK's order: vertices, edge nodes, nodes of quadrilaterals, and one in the middle.
 
     Attributes:
-        vertices: how many.
+        vertices: number of vertices.
         edges: pairs of vertices.
-        faces: vertices of the sides of cells in space, around each, seen from outside; none in the plane, whose sides are edges.
-        quads: vertices of quadrilaterals that have a node in the middle where the cell is complete.
-        centre: whether there is one in the middle, too.
+        faces: vertices of the sides of 3D cells, in order around each, seen from outside; empty in 2D, where sides are edges.
+        quads: vertices of quadrilaterals with a middle node in the complete cell.
+        centre: whether the complete cell has a node in its middle.
     """
 
     vertices: int
@@ -79,8 +79,8 @@ class Block:
     """Cells of one kind.
 
     Attributes:
-        type: meshio's name, as ``"hexahedron20"``.
-        data: nodes of each, in VTK's order ``(n, k)``.
+        type: meshio's name, such as ``"hexahedron20"``.
+        data: nodes of each cell, in VTK's order ``(n, k)``.
         numbers: of the cells in the file ``(n,)``, if it has any.
     """
 
@@ -90,7 +90,7 @@ class Block:
 
     @property
     def base(self) -> str:
-        """Name of the kind that has vertices alone."""
+        """Name of the kind with vertices only."""
         return self.type.rstrip("0123456789")
 
     @property
@@ -102,15 +102,15 @@ class Block:
 
 @dataclass(frozen=True)
 class Found:
-    """A mesh as it stands in a file.
+    """A mesh as stored in a file.
 
     Attributes:
-        points: all nodes, also those of no cell ``(n, 2 or 3)``.
+        points: all nodes, including nodes without cell ``(n, 2 or 3)``.
         cells: blocks of cells of any dimension.
         cell_sets: members of each set in every block, by name.
         point_sets: nodes of each set, by name.
         sides: vertices of the facets of each surface, one array for each number of vertices, by name.
-        cell_data: whole numbers that cells share, in every block, by name.
+        cell_data: integers of cells, in every block, by name.
     """
 
     points: Array
@@ -131,13 +131,13 @@ class Found:
         return [block for block in self.cells if block.dim == self.dim]
 
     def with_cells(self, points: Array, cells: list[Block], **others: Any) -> Found:
-        """The same with more nodes, and other cells in its blocks."""
+        """The same mesh with more nodes, and other cells in its blocks."""
         return replace(self, points=points, cells=cells, **others)
 
 
-#: What meshio tells of files of Gmsh that is not of the mesh.
+#: Data of Gmsh files from meshio that do not belong to the mesh.
 NOT_OF_MESH = ("gmsh:geometrical", "gmsh:bounding_entities")
-#: Nodes of cells as meshio takes them from files of Gmsh without putting them into VTK's order.
+#: Node order of cells that meshio reads from Gmsh files without conversion to VTK's order.
 OF_GMSH = {
     "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
     "pyramid14": [0, 1, 2, 3, 4, 5, 8, 10, 6, 7, 9, 11, 12, 13],
@@ -145,12 +145,12 @@ OF_GMSH = {
 
 
 def from_meshio(found: Any, of_gmsh: bool = False) -> Found:
-    """A mesh that meshio has read, perhaps from a file of Gmsh."""
+    """A mesh read by meshio, possibly from a Gmsh file."""
     numbers = {}
     for name, values in found.cell_data.items():
         if name not in NOT_OF_MESH and all(np.issubdtype(np.asarray(v).dtype, np.integer) and np.ndim(v) == 1 for v in values):
             every = [np.asarray(v, dtype=np.int64) for v in values]
-            # as many values as cells are numbers of cells
+            # distinct values for all cells are numbers of cells
             if len(np.unique(np.concatenate(every))) < sum(map(len, every)):
                 numbers[name] = every
     none = np.zeros(0, np.int64)

@@ -1,4 +1,4 @@
-"""From a mesh file of another program to a distributed mesh with its sets as tags."""
+"""Conversion of a mesh file of another program to a distributed mesh with its sets as tags."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MESHIO_CELLS = {
     "triangle6": ("triangle", 2), "quad9": ("quadrilateral", 2), "tetra10": ("tetrahedron", 2), "hexahedron27": ("hexahedron", 2),
 }  # fmt: skip
 
-#: Vertices of what surfaces consist of.
+#: Numbers of vertices of surface entities.
 MESHIO_VERTICES = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
 
 
@@ -74,7 +74,7 @@ def read_mesh(path: str | Path, comm: MPI.Comm, gdim: int | None = None, *, cell
 
 
 def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
-    """The whole mesh, with its nodes numbered as far as cells have them."""
+    """The whole mesh, with numbers for all nodes that belong to cells."""
     if path.suffix == ".geo":
         raise MeshError(f"cells = 'simplices' is for meshes, and {path} is not meshed: leave it out, and recombine nothing")
     if not path.is_file():
@@ -122,7 +122,7 @@ def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
 
 
 def _found(path: Path) -> Found:
-    """What is in the file."""
+    """Content of the file."""
     if path.suffix.lower() == ".inp":
         from uem_dolfinx.geometry.decks import read_deck
 
@@ -135,14 +135,14 @@ def _found(path: Path) -> Found:
     try:
         with redirect_stdout(said), redirect_stderr(said):
             return from_meshio(meshio.read(path), path.suffix == ".msh")
-    # meshio raises whatever a file that it does not understand leads to, and leaves the process where it knows no reader
+    # for files that it cannot read, meshio raises various exceptions, or SystemExit without a reader
     except (Exception, SystemExit) as error:
         told = " ".join(said.getvalue().split()) or str(error)
         raise MeshError(f"meshio cannot read {path}: {told}") from error
 
 
 def _sets_of_cells(found: Found, place: Ints) -> Iterator[Group]:
-    """Sets of cells and of what is on their surfaces, without their numbers."""
+    """Sets of cells and of surface entities, without their numbers."""
     sets, dim = dict(found.cell_sets), found.dim
     for name, values in found.cell_data.items():
         for value in np.unique(np.concatenate(values)).tolist():
@@ -163,23 +163,23 @@ def _sets_of_cells(found: Found, place: Ints) -> Iterator[Group]:
 
 
 def _in_bodies(rows: Ints, place: Ints) -> Ints:
-    """Entities by the places of their vertices, ascending, of those that cells have."""
+    """Entities by the indices of their vertices, ascending, without entities off the cells."""
     vertices = np.sort(place[rows], axis=1)
     return vertices[(vertices >= 0).all(axis=1)]
 
 
 def _surfaces(found: Found, place: Ints) -> Iterator[Group]:
-    """Likewise surfaces of sides."""
+    """Surfaces given by sides of cells."""
     for name, sides in found.sides.items():
         parts = [_in_bodies(rows, place) for rows in sides]
         yield Group(name, 0, found.dim - 1, np.concatenate(parts) if parts else np.zeros((0, found.dim), np.int64))
 
 
 def _sets_of_nodes(found: Found, place: Ints, raw: RawMesh, of_file: Bools) -> Iterator[Group]:
-    """Likewise sets of nodes.
+    """Sets of nodes.
 
-    They are of facets where all their nodes are on exterior facets of which they have all nodes, and of points where any is not. Nodes
-    that serendipity cells lack in the file may be on none: ``of_file`` are all others.
+    A set becomes a set of facets if all its nodes lie on exterior facets with all nodes in the set, otherwise a set of points. This
+    criterion ignores nodes added to serendipity cells: ``of_file`` are all other nodes.
     """
     nodes, topology = compat.from_gmsh(raw.cell, raw.cells), forms.reference_topology(raw.cell)
     # of every facet its vertices first

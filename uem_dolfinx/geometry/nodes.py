@@ -1,4 +1,4 @@
-"""Nodes of a space: which rank has them, and what ranks tell each other about them."""
+"""Nodes of a space: ownership, and communication of nodal values between ranks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from uem_dolfinx.parallel import Exchange, agree, gathered, reduced
 
 
 class Nodes:
-    """Nodes of a Lagrange space with any number of components each, and where they are at first (collective).
+    """Nodes of a Lagrange space with any number of components, and their reference positions (collective).
 
     Args:
         V: the space.
@@ -29,13 +29,13 @@ class Nodes:
         block: number of components of a node: 1 of a temperature, the dimension of a displacement.
         index_map: owned nodes and ghosts.
         n_owned: number of nodes that this rank owns.
-        n_local: that and its ghosts.
+        n_local: number of owned nodes and ghosts.
         first: global number of the first owned node.
         n_global: global numbers of all ranks' nodes are below it.
         X: reference positions of the local nodes ``(n_local, gdim)``, ghosts included.
 
     Raises:
-        MeshError: if a node's place is not finite.
+        MeshError: if a node's position is not finite.
     """
 
     def __init__(self, V: Any):
@@ -53,10 +53,10 @@ class Nodes:
         self.X: Array = self.from_owners(every, V.tabulate_dof_coordinates()[: self.n_local, : self.gdim], every)
 
     def modes(self, centred: bool = False) -> Array:
-        """Fields that bodies do not resist, at the owned nodes: a constant of each component ``(n_owned, n_modes, block)``.
+        """Zero-energy fields at the owned nodes: a constant of each component ``(n_owned, n_modes, block)``.
 
         Args:
-            centred: whether all are to be of one size (collective if so).
+            centred: whether all are scaled to one size (collective if so).
         """
         return np.broadcast_to(np.eye(self.block), (self.n_owned, self.block, self.block))
 
@@ -67,7 +67,7 @@ class Nodes:
 
     @cached_property
     def _like(self) -> PETSc.Vec:
-        """What vectors are made after."""
+        """Template for vectors."""
         sizes = self.block * self.n_owned, self.block * self.n_global
         return PETSc.Vec().createMPI(sizes, bsize=self.block, comm=self.comm)
 
@@ -77,7 +77,7 @@ class Nodes:
         v.array[:] = 0.0 if values is None else np.ravel(values)
         return v
 
-    #: Whether what is solved for has unknowns beside those of the nodes.
+    #: Whether there are unknowns in addition to nodal ones.
     mixed = False
 
     def create_matrix(self, a: Any) -> PETSc.Mat:
@@ -85,7 +85,7 @@ class Nodes:
         return forms.create_matrix(a)
 
     def complete(self, K: PETSc.Mat, free: Bools) -> None:
-        """Put its largest entry on the diagonal of K where that is zero and components are held, which P crosses out (collective).
+        """Set zero diagonal entries of K for fixed components, which P eliminates, to its largest entry (collective).
 
         Args:
             K: just assembled.
@@ -97,20 +97,20 @@ class Nodes:
         K.setDiagonal(diagonal)
 
     def multipliers(self, A: PETSc.Mat) -> int:
-        """Number of unknowns that are expected to make a negative eigenvalue each (collective): none of a displacement."""
+        """Number of unknowns with an expected negative eigenvalue (collective): zero for a displacement."""
         return 0
 
     def norms(self, v: PETSc.Vec) -> Any:
-        """Norm of a vector; among other fields one for each field, the displacement's first ``(n_fields,)`` (collective)."""
+        """Norm of a vector; with other fields one norm per field, the displacement first ``(n_fields,)`` (collective)."""
         return v.norm()
 
     def work(self, q: PETSc.Vec, F: PETSc.Vec) -> float:
-        """Work of forces along an increment, that of the displacement alone (collective)."""
+        """Work of forces in an increment, for the displacement only (collective)."""
         return float(q.dot(F))
 
     @cached_property
     def _work(self) -> fem.Function:
-        """Holds what is sent between owners and ghosts."""
+        """Buffer for values sent between owners and ghosts."""
         return fem.Function(self.V)
 
     def from_owners(self, nodes: npt.NDArray[np.integer], values: Array, wanted: npt.NDArray[np.integer]) -> Array:
@@ -160,20 +160,20 @@ class Nodes:
         return sums_of_rows(*self.send_to_owners(nodes, values), self.n_owned)
 
     def describe(self, node: int) -> str:
-        """Where a local node is, for error messages."""
+        """Position of a local node, for error messages."""
         return described(self.X[node])
 
 
 def described(place: Array) -> str:
-    """A place ``(gdim,)``, for error messages."""
+    """A position ``(gdim,)``, for error messages."""
     return "(" + ", ".join(f"{c:.6g}" for c in place) + ")"
 
 
 def check_places(mesh: Any) -> None:
-    """Refuse a mesh with nodes that are nowhere (collective).
+    """Refuse a mesh with nodes whose coordinates are not finite (collective).
 
     Raises:
-        MeshError: naming the first of them, by its number in the mesh's input, and where it is said to be.
+        MeshError: with number in the mesh's input and coordinates of the first such node.
     """
     x, number = mesh.geometry.x[:, : mesh.geometry.dim], np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
     bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
@@ -188,7 +188,7 @@ def check_places(mesh: Any) -> None:
 
 
 class Halo:
-    """Global nodes that this rank looks at, of any rank, and their owners (collective).
+    """Communication with the owners of global nodes that this rank needs (collective).
 
     Args:
         space: the space.
@@ -199,17 +199,17 @@ class Halo:
         self._space, self._size = space, len(nodes)
         self._exchange = Exchange.to(space.comm, space.owner_of(nodes))
         (asked,) = self._exchange.send(nodes)
-        #: Local numbers of the owned nodes that ranks look at, each as often as it is.
+        #: Local numbers of the owned nodes that other ranks need, with repetitions.
         self.asked: Ints = asked - space.first
 
     def take(self, values: Callable[[Ints], Array]) -> Array:
-        """What owners have there ``(m, ...)``: ``values`` of their local nodes ``(k,)``, in rows of any shape (collective)."""
+        """Values of the owners at the nodes ``(m, ...)``, from ``values`` at their local nodes ``(k,)``, rows of any shape (collective)."""
         (told,) = self._exchange.back(values(self.asked))
         out = np.empty((self._size, *told.shape[1:]), told.dtype)
         out[self._exchange.rows] = told
         return out
 
     def add(self, values: Array) -> Array:
-        """Sums of ``values (m, k)`` that ranks have there, at their owners ``(n_owned, k)`` (collective)."""
+        """Sums of ``values (m, k)`` of all ranks at their owners ``(n_owned, k)`` (collective)."""
         (arrived,) = self._exchange.send(values)
         return sums_of_rows(self.asked, arrived, self._space.n_owned)

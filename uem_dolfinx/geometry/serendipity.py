@@ -1,7 +1,7 @@
-"""Serendipity cells, which have nodes on edges alone, made complete: nodes are added in the middle of quadrilaterals and hexahedra.
+"""Completion of serendipity cells: nodes are added in the middle of quadrilaterals and hexahedra.
 
-The map of a serendipity cell is a polynomial of the complete cell, too. New nodes are where it takes the middles, so that the complete
-cell has the very same shape:
+The map of a serendipity cell is a polynomial of the complete cell, too. New nodes are the images of the middles under this map, so
+that the complete cell has exactly the same shape:
 
     x_quad = (2 sum of edges - sum of vertices) / 4        x_hexahedron = (sum of edges - sum of vertices) / 4
 """
@@ -15,20 +15,19 @@ import numpy as np
 from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.geometry.found import KINDS, Block, Found
 
-#: Cells of meshio with nodes on edges alone, but for those that have no quadrilaterals.
+#: Cells of meshio with nodes on edges only, except cells without quadrilaterals.
 SERENDIPITY = {"quad8": "quad9", "hexahedron20": "hexahedron27", "wedge15": "wedge18", "pyramid13": "pyramid14"}
 
 
 def completed(found: Found) -> tuple[Found, int]:
-    """The mesh with complete cells in place of serendipity ones, and how many nodes were added.
+    """The mesh with complete cells in place of serendipity cells, and the number of added nodes.
 
-    Cells that share a quadrilateral share its new node. Sets of nodes that have all nodes of a quadrilateral or of a hexahedron have its
-    new node, too.
+    Cells that share a quadrilateral share its new node. Sets with all nodes of a quadrilateral or hexahedron get its new node.
     """
     asked = [block for block in found.cells if block.type in SERENDIPITY]
     if not asked:
         return found, 0
-    # nodes of all quadrilaterals, each once, by their vertices
+    # nodes of all distinct quadrilaterals, by their vertices
     parts = [_quads(block) for block in asked]
     corners, edges = (np.concatenate([part[i].reshape(-1, 4) for part in parts]) for i in (0, 1))
     _, first, number = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_inverse=True)
@@ -55,7 +54,7 @@ def completed(found: Found) -> tuple[Found, int]:
 
 
 def _with_new(nodes: Ints, count: int, around: list[tuple[Ints, Ints]]) -> Ints:
-    """Nodes of a set, and of so many those new ones that it has all nodes around of: new ones ``(n,)``, and nodes around ``(n, k)``."""
+    """Nodes of a set with new nodes ``(n,)`` whose surrounding nodes ``(n, k)`` all belong to it; ``count`` is the number of nodes."""
     listed: Bools = np.zeros(count, dtype=bool)
     listed[nodes] = True
     return np.concatenate([nodes, *(new[listed[old].all(axis=1)] for new, old in around)])

@@ -1,4 +1,4 @@
-"""Densities over a contactor's surface whose integrals are sums of what contactors carry: fields to be integrated."""
+"""Densities on a contactor's surface whose integrals equal sums over contactors."""
 
 from __future__ import annotations
 

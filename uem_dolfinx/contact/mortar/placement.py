@@ -1,4 +1,4 @@
-"""Weighted gaps of a mortar discretisation: what contact asks of the rows that integrals over segments have made."""
+"""Weighted gaps of a mortar discretisation: ``Kinematics`` from the rows of integrals over segments."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from uem_dolfinx.geometry.search import MeshTarget
 
 
 class Contactors(OnTarget):
-    """Contactor facets of one target; other arguments as those of ``OnTarget``.
+    """Contactor facets of one target; other arguments as for ``OnTarget``.
 
     Args:
         surface: the contactor's facets.
 
     Attributes:
-        faced: contactor and target facets that have faced each other in this step, by what tells them in any partition ``(p, 2)``.
+        faced: keys, independent of the partition, of contactor and target facets that have faced each other in this step ``(p, 2)``.
     """
 
     at_feet = False
@@ -47,7 +47,7 @@ class Contactors(OnTarget):
         self.faced: Ints = np.zeros((0, 2), np.int64)
 
     def begin_step(self) -> None:
-        """As of ``OnTarget``; which facets have faced each other is forgotten."""
+        """See ``OnTarget``; also resets the pairs of facets that have faced each other."""
         super().begin_step()
         self.faced = np.zeros((0, 2), np.int64)
 
@@ -62,7 +62,7 @@ class Contactors(OnTarget):
             out[:, 1] = planes.axes[:, 0]
             out[:, 0] = -out[:, 1]
             return out
-        # twice the area vector of a ring of corners is the sum of the products of each with the next
+        # twice the area vector of a polygon is the sum of the cross products of consecutive corners
         ring, n = self.surface.shape.ring, planes.normal * self.surface.sign[facets, None]
         corners = x[:, ring]
         across = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
@@ -85,7 +85,7 @@ class Contactors(OnTarget):
         return shares, out
 
     def stretch(self, facets: Ints, size: Array) -> Array:
-        """Areas that facets around contactors have grown to, ``size (k,)``, over their reference areas ``(n,)`` (collective)."""
+        """Current areas ``size (k,)`` of facets around contactors over their reference areas ``(n,)`` (collective)."""
         dofs, X = self.surface.dofs[facets], self.config.X[self.surface.dofs]
         shares = self.shares(size, self.surface.x[facets]), self.shares(self.sizes(X), X)[facets]
         now, then = (self.config.to_owners(dofs.ravel(), own.ravel())[self.nodes] for own in shares)
@@ -94,12 +94,12 @@ class Contactors(OnTarget):
 
 @dataclass(frozen=True)
 class MortarKinematics(PlacedOnTarget):
-    """Implements ``Kinematics``: weighted gaps. The projection has these, and the directions of the plain rows.
+    """Implements ``Kinematics`` with weighted gaps, which the projection contains with the directions of the plain rows.
 
     Attributes:
-        rows: all equations and what they were made of.
-        movable: contactors that can move along the normal, or something that they follow can ``(n,)``.
-        out: contactors that are not to meet the target ``(n,)``; None for none.
+        rows: all equations and their data.
+        movable: contactors that can move along the normal, or whose followed nodes can ``(n,)``.
+        out: contactors that must not touch the target ``(n,)``, or None.
     """
 
     of: Contactors
@@ -109,41 +109,41 @@ class MortarKinematics(PlacedOnTarget):
 
     @property
     def corners(self) -> None:
-        """No corner holds a facet."""
+        """None, since corners hold no facets."""
         return None
 
     @property
     def normal(self) -> Array:
-        """Directions of the derivatives of the gaps with the contactors' own displacements ``(n, gdim)``."""
+        """Directions of the gaps' derivatives by the contactors' own displacements ``(n, gdim)``."""
         assert self.rows.normal is not None
         return self.rows.normal
 
     @cached_property
     def ties(self) -> Ties:
-        """With integrals of the dual functions times the shape functions of both sides, over that of the contactor's own."""
+        """Weights are integrals of dual functions times shape functions of both sides, over the integral of the contactor's own."""
         of = self.of
         assert self.rows.weights is not None
         return Ties.of(of.config, of.nodes, self.rows.weights, of.free_of_owned if of.prescribed else None, of.at_feet)
 
     @property
     def force_per_multiplier(self) -> Array:
-        """Of all that the facets at a contactor push with, each along its own derivative of the gap."""
+        """Relative to the sum of the facets' forces, each along its own derivative of the gap."""
         assert self.rows.push is not None
         return np.asarray(self.rows.share / self.rows.push)
 
     @property
     def cone(self) -> Array:
-        """Of equations that were divided by the lengths of their derivatives."""
+        """For equations divided by the lengths of their derivatives."""
         assert self.rows.push is not None
         return np.asarray(self.rows.push / self.rows.length)
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
     def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:
-        """Count how often contactors that nothing covers change facets, until they get averaged normals: equations do not change here.
+        """Count changes of facet by uncovered contactors, until they get averaged normals; equations do not change here.
 
-        What a rigid target covers is kept in mind, and of what a mesh covers the nodes with a dual function of their own, and for the
-        step the facets that face each other.
+        The state stores facets covered by a rigid target, or nodes with a dual function of their own on a mesh. Facets that face
+        each other are stored until the end of the step.
         """
         of, rows = self.of, self.rows
         if of.sliding == "finite":
@@ -165,7 +165,7 @@ class MortarKinematics(PlacedOnTarget):
 
     @cached_property
     def ends(self) -> Ends:
-        """Of contactors that the target covers, or not; rigid ones have none."""
+        """Open ends by the covered part of contactors; rigid targets have none."""
         rows, meshed = self.rows, self.of.target.n_nodes > 0
         share = np.where(rows.covered, rows.ratio, -1.0) if meshed else np.ones(len(self.points))
         return Ends(self.projection, self.of.thickness, share=share, out=self.out)
@@ -186,7 +186,7 @@ class MortarKinematics(PlacedOnTarget):
         return curvature(rows.points, at_nodes)
 
     def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
-        """Of those that the target covers: traction turns, grows with its surface and is handed to what is opposite (collective)."""
+        """For covered contactors: rotation and scaling of the traction, and its transmission to opposite nodes (collective)."""
         of, rows = self.of, self.rows
         assert rows.weights is not None
         kept = rows.covered[which]
@@ -195,7 +195,7 @@ class MortarKinematics(PlacedOnTarget):
         return turning(of.elimination, rows, of.surface.dofs[rows.facets], frictional, rows.weights)
 
     def pressure_map(self, current: bool) -> PressureMap:
-        """Multipliers are pressures where the surface is now, and forces over kept areas with small and fixed sliding (collective)."""
+        """Multipliers are current pressures with finite sliding, and forces over kept areas with small and fixed sliding (collective)."""
         of, rows, finite, every = self.of, self.rows, self.of.sliding == "finite", np.arange(len(self.of.surface.dofs))
         area = rows.area if current and finite else rows.area / rows.stretch
         stretch = None
@@ -207,9 +207,9 @@ class MortarKinematics(PlacedOnTarget):
         return PressureMap(rows.share / rows.length, known=rows.covered, area=area, stretch=stretch)
 
     def heights(self) -> Array:
-        """Nodal heights whose means, weighted with dual functions, are those of the gaps (collective).
+        """Nodal heights whose means, weighted with dual functions, equal the means of the gaps (collective).
 
-        Functions of degree 2 have them in Bernstein's basis first, whose coefficients at the middles are made of those around.
+        At degree 2 they are first computed in the Bernstein basis, and then converted to nodal values.
         """
         of, rows, dofs = self.of, self.rows, self.of.surface.dofs
         means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
@@ -219,7 +219,7 @@ class MortarKinematics(PlacedOnTarget):
         return np.asarray(total[of.nodes] / count[of.nodes])
 
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
-        """By the integrals of the dual functions over what is covered; others at their nodes (collective)."""
+        """Means by the integrals of the dual functions over the covered part; values at the nodes of other contactors (collective)."""
         of, rows, at = self.of, self.rows, self.rows.points
         own, area = at.nodes, at.duals.C.sum(axis=2)
         f, i = np.nonzero(area > 0)

@@ -135,10 +135,10 @@ class SegmentPoints:
     # -- first derivatives -----------------------------------------------------------------------------------------------
 
     def gap_derivatives(self) -> tuple[Array, Array]:
-        """What the derivatives of weighted gaps have beyond ``-n int psi_j (phi_a, -N_l)``.
+        """Derivatives of weighted gaps in addition to ``-n int psi_j (phi_a, -N_l)``.
 
         Returns:
-            With respect to the contactor facets' nodes ``(m, nc, nc, gdim)`` and to the target's, pair by pair ``(k, nc, nt, gdim)``.
+            Derivatives by the contactor facets' nodes ``(m, nc, nc, gdim)`` and by the target's, pair by pair ``(k, nc, nt, gdim)``.
         """
         s, e, g = self.segments, self.facet, self.to_gap.shape[1]
         (m, nc), (k, nt) = self.nodes.shape, self.opposite.shape
@@ -172,7 +172,7 @@ class SegmentPoints:
         return by_node, by_pair
 
     def _add_ends(self, shape: FacetShape, on_facet: Array, on_target: Array) -> None:
-        """Add how weighted gaps change where the target, with facets of such a ``shape``, ends over contactor facets."""
+        """Add derivatives of weighted gaps at ends of the target, with facets of this ``shape``, over contactor facets."""
         which = self.partly_covered()
         sides = self.sides(shape, which).at_ends()
         e = self.facet[which][sides.pair]
@@ -183,7 +183,7 @@ class SegmentPoints:
         np.add.at(on_target, which[sides.pair], way[:, :, nc:])
 
     def partly_covered(self) -> Ints:
-        """Pairs whose contactor facets are not covered altogether ``(p,)``."""
+        """Pairs whose contactor facets are partly covered ``(p,)``."""
         some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
         return np.flatnonzero((self.covered.D.sum(axis=1) < (1 - SLIVER) * self.covered.full.sum(axis=1))[self.facet] & some)
 
@@ -196,7 +196,7 @@ class SegmentPoints:
             pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
 
         Returns:
-            Global nodes of the pairs that press ``(p, nc + nt)``, and symmetric blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
+            Global nodes of the pairs with pressure ``(p, nc + nt)``, and symmetric blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
         """
         nc, nt, g = self.nodes.shape[1], self.opposite.shape[1], self.to_gap.shape[1]
         some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
@@ -215,7 +215,7 @@ class SegmentPoints:
             step = np.einsum("qb,qb->q", sides.b, amount[sides.pair]) * sides.weight * sides.slope
             half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
         elif self.shape_operator is not None:
-            # there are as many pairs as facets, and points in their order
+            # pairs correspond to facets, with points in their order
             shape_operator = self.shape_operator[np.isin(self.segments.pair, pressing)]
             for row, unit in zip(np.moveaxis(shape_operator, 1, 0), np.eye(g)):
                 half += 0.5 * sum_of_products(pair, force, motions.along(row), motions.along(np.tile(unit, (len(pair), 1))), k)
@@ -320,7 +320,7 @@ class SegmentPoints:
         own, its = planes.coordinates(self.x[e]), planes.coordinates(y)
         s = ends(own, shape, its) if shape.dim == 1 else edges(self.shape, own, shape, its, cuts)
         pair = s.pair
-        # a side that two facets of the target share is found twice over a contactor facet
+        # a side shared by two target facets occurs twice over a contactor facet
         code = np.column_stack([e[pair], np.sort(self.opposite[which][pair[:, None], s.corners], axis=1)])
         _, first, same = np.unique(code, axis=0, return_index=True, return_inverse=True)
         same = same.ravel()

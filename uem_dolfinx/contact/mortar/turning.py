@@ -131,17 +131,17 @@ def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: I
 def turning(
     elimination: Elimination, rows: WeightedRows, dofs: Indices, frictional: Frictional, weights: Terms
 ) -> list[tuple[Ints, Array]]:
-    """Derivatives of forces of friction: with the coefficients of those that slip and the multipliers of others kept (collective).
+    """Derivatives of friction forces, at constant coefficients for slipping contactors and constant multipliers for others (collective).
 
     Args:
         elimination: of the contactors.
         rows: equations of all contactors, where they were made.
         dofs: local nodes of the contactor facets ``(m, nc)``.
         frictional: the contactors with friction.
-        weights: by what all contactors follow other nodes.
+        weights: weights by which all contactors follow other nodes.
 
     Returns:
-        Lists of global nodes, -1 for none ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
+        Lists of global nodes, -1 for no node ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
     """
     at, config, (which, normal, tau) = rows.points, elimination.config, (frictional.which, frictional.normal, frictional.tau)
     n, g, (m, nc) = len(rows.covered), tau.shape[1], dofs.shape
