@@ -25,7 +25,7 @@ class Offsets:
         name: of its contact, for messages.
 
     Attributes:
-        pair: likewise.
+        pair: the present interface.
         adjusted: initial heights of contactors that are treated as touching ``(n,)``.
         worn: wear depths ``(n,)``.
     """

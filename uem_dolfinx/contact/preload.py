@@ -78,7 +78,7 @@ class Preload(Contact):
         axis = "" if self._axis is None else f", axis={self._axis.tolist()}"
         return f"Preload({self.name!r}{axis}, force={given.shown(self._force)}, coupling={self.coupling!r})"
 
-    # -- what users do with it -------------------------------------------------------------------------------------------
+    # -- for users -------------------------------------------------------------------------------------------------------
 
     def tighten(self, force: float | Callable[[float], float]) -> None:
         """Prescribe another force, from the next step on; a locked section is unlocked (collective).

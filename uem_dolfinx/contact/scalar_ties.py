@@ -99,9 +99,9 @@ class ScalarTie:
         self.followed: Indices = np.flatnonzero(followed).astype(np.int32)
 
     def n_values(self, block: int) -> int:
-        """As of ``LinearEquations``."""
+        """See ``LinearEquations``."""
         return 1
 
     def rows(self, config: Configuration, role: str) -> GivenRows:
-        """As of ``LinearEquations``."""
+        """See ``LinearEquations``."""
         return self._rows

@@ -82,7 +82,7 @@ def revolved(form: ufl.Form) -> ufl.Form:
 
 
 def circumference(domain: Any, u: Any = None) -> Any:
-    """``2 pi r`` in UFL, as drawn, or of the present radius with a displacement."""
+    """``2 pi r`` in UFL, with the reference radius, or the current radius for a displacement."""
     r = ufl.SpatialCoordinate(domain)[0]
     return 2 * np.pi * (r if u is None else r + u[0])
 

@@ -70,7 +70,7 @@ def _find_bodies(nodes: Nodes, cells: Indices) -> tuple[Ints, int]:
     view = label.x.array.reshape(-1, nodes.block)
 
     def shared(mine: Ints) -> Ints:
-        """What owners call the pieces of nodes here."""
+        """Numbers of the pieces of local nodes on the ranks of their owners."""
         view[:, 0] = mine
         label.x.scatter_forward()
         return np.column_stack([mine, view[:, 0].astype(np.int64)])

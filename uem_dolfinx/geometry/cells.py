@@ -84,8 +84,8 @@ def check_volumes(cell: str, degree: int, cells: Ints, points: Array, label: str
         degree: of the geometry.
         cells: nodes of each cell in DOLFINx's order ``(n, m)``.
         points: see ``check_nodes``.
-        label: likewise.
-        numbers: likewise.
+        label: see ``check_nodes``.
+        numbers: see ``check_nodes``.
 
     Raises:
         MeshError: for a cell whose volume is zero relative to its size.

@@ -75,13 +75,13 @@ class SharpEdges:
 
 
 def find_crossing(own: SharpEdges, theirs: SharpEdges, told: tuple[Ints, Ints], meet: Any) -> Crossing | None:
-    """The deepest crossing of edges of two surfaces, which may be the same one; None for none (collective).
+    """The deepest crossing of edges of two surfaces, which may be identical; None without crossing (collective).
 
     Args:
         own: edges of the one.
         theirs: edges of the other.
-        told: what is known of pieces ``(k, m)`` of each.
-        meet: which of pieces may meet, by what is known of them ``(n, m)`` each: ``(n,)``.
+        told: visibility keys of the edge segments of both ``(k, m)``.
+        meet: function of two arrays of keys ``(n, m)`` that returns whether segments may meet ``(n,)``.
     """
     comm = own.facets.config.comm
     (x, n), (y, m) = own.now(), theirs.now()

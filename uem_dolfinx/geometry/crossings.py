@@ -1,4 +1,4 @@
-"""Where straight ways of points cross moving facets: the exact times, and whether they lead into the body or out of it.
+"""Crossings of straight paths of points with moving facets: exact times, and entry into or exit from the body.
 
 Facets are cut into simplices between neighbouring nodes, whose nodes move straight as the points do: the height of a point over the
 plane of its simplex is a cubic of time (in 2D a square), which is bracketed between its extremes. Of one body that turns and bends ways
@@ -31,12 +31,12 @@ class Crossings:
     """Crossings of ``k`` simplices, in no order.
 
     Attributes:
-        point: which point crosses ``(k,)``.
-        facet: which simplex, or number over all ranks of the facet that it is a piece of ``(k,)``.
-        way: length of the point's way as seen from there ``(k,)``.
-        time: when, 0 at the start and 1 at the end of its way ``(k,)``.
+        point: index of the point ``(k,)``.
+        facet: index of the simplex, or number over all ranks of its facet ``(k,)``.
+        way: length of the point's path relative to the simplex ``(k,)``.
+        time: 0 at the start and 1 at the end of the path ``(k,)``.
         inwards: whether it enters the body ``(k,)``, or leaves it.
-        normal: outward unit normals there and then ``(k, gdim)``.
+        normal: outward unit normals at the crossing ``(k, gdim)``.
     """
 
     point: Ints
@@ -55,15 +55,15 @@ def find_crossings(
     meet: Callable[[Ints, Ints], Bools] | None = None,
     turning: bool = False,
 ) -> Crossings:
-    """Crossings of ``n`` points with ``m`` simplices of ``gdim`` nodes each, all of which move straight.
+    """Crossings of ``n`` points with ``m`` simplices of ``gdim`` nodes each; all move on straight paths.
 
     Args:
         start: points ``(n, gdim)`` and simplices ``(m, gdim, gdim)`` at the beginning.
         end: the same at the end.
         sign: 1 where a simplex is numbered so that its normal points out of its body, -1 where it points inwards ``(m,)``.
-        reach: length by which each point's way is continued at both ends: points that rest on a facet cross it.
+        reach: length by which each point's path is extended at both ends, so that points at rest on a facet cross it.
         meet: which of points and simplices ``(k,)`` each count; None are all.
-        turning: whether ways are straight as seen from the simplices, which turn, instead of in space.
+        turning: whether paths are straight relative to the rotating simplices, not in space.
     """
     (p0, x0), (p1, x1) = start, end
     i, f = _near(p0, p1, x0, x1, reach, not turning)
@@ -118,13 +118,13 @@ def cross_target(
 
     Args:
         target: the surface.
-        which: what the points are called ``(k,)``.
+        which: numbers of the points ``(k,)``.
         points: at the beginning and at the end ``(k, gdim)`` each.
-        nodes: of this rank's facets likewise ``(m, nn, gdim)`` each.
-        reach: as of ``find_crossings``.
-        told: what facets' ranks have to know of the points ``(k, ...)``.
-        meet: tells of which of these and of this rank's facets ``(k,)`` crossings count.
-        turning: as of ``find_crossings``.
+        nodes: of this rank's facets at the beginning and at the end ``(m, nn, gdim)`` each.
+        reach: see ``find_crossings``.
+        told: visibility keys of the points ``(k, ...)``.
+        meet: function of these keys and this rank's facets ``(k,)`` that returns whether crossings count.
+        turning: see ``find_crossings``.
     """
     comm, (p0, p1), g, pieces = target.comm, points, points[0].shape[1], target.shape.pieces
     low, high = _boxes(p0[:, None], p1[:, None], turning)
@@ -141,7 +141,7 @@ def cross_target(
 
 
 def entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
-    """Pairs of an entry and a later exit of the same point ``(k,)`` each, and the exits that no entry comes before."""
+    """Pairs of an entry and a later exit of the same point ``(k,)`` each, and exits without an earlier entry."""
     ins, outs = np.flatnonzero(found.inwards), np.flatnonzero(~found.inwards)
     ins = ins[np.argsort(found.point[ins], kind="stable")]
     first, last = (np.searchsorted(found.point[ins], found.point[outs], side=side) for side in ("left", "right"))

@@ -189,12 +189,12 @@ def _constants(path: Path) -> list[str]:
 
 
 def _text(path: Path) -> str:
-    """A file's text; what is not UTF-8 in it stays what it is when it is written again."""
+    """A file's text; bytes that are not UTF-8 are preserved when it is written again."""
     return path.read_text(encoding="utf-8", errors="surrogateescape")
 
 
 def _included(path: Path, known: tuple[Path, ...] = ()) -> list[Path]:
-    """A .geo file and the files that it includes, each as often as it is included, but for those that include themselves."""
+    """A .geo file and the files that it includes, each as often as it is included, without recursive includes."""
     files = [path]
     for how, name in re.findall(INCLUDED, _text(path)):
         file = path.parent / name

@@ -38,7 +38,7 @@ class SharedTarget:
         self._target.motion = motion
 
     def project(self, points: Array) -> Projection:
-        """Where points stand relative to it (collective)."""
+        """Projection of points onto it (collective)."""
         return ask_together(self._comm, self._words, self._target.project, points)
 
     def follow(self, points: Array, old: Any) -> Projection:

@@ -60,7 +60,7 @@ class Tags(Mapping[Key, Tag]):
     """Physical groups of a mesh by name, by number, or by ``(dim, name or number)``.
 
     Args:
-        tags: all groups, alike on all ranks but for their entities.
+        tags: all groups, equal on all ranks except for their entities.
         sizes: number of entities of each over all ranks, shape ``(len(tags),)``.
     """
 
@@ -133,7 +133,7 @@ def name_of(part: Part) -> str:
 
 
 def communicator_of(part: Any) -> MPI.Comm | None:
-    """Communicator of the mesh of a part, None where it does not tell its mesh."""
+    """Communicator of the mesh of a part, None if the part does not determine its mesh."""
     if isinstance(part, Tag):
         return part.mesh.comm
     if _with_value(part):

@@ -1,4 +1,4 @@
-"""Equations of an interface with friction: those along the target of contactors that stick, and rotated test rows of those that slip."""
+"""Equations with friction: tangential equations of sticking contactors, and rotated test rows of slipping contactors."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def with_friction(
     pointwise: bool,
     keeps_ties: bool,
 ) -> Constraints:
-    """Equations with those along the target, and rotated test rows where contactors slip (collective).
+    """Add tangential equations of sticking contactors, and rotate test rows of slipping contactors (collective).
 
     Args:
-        own: equations across the target.
-        frame: directions along it and relative motions.
-        of_friction: active contactors that friction acts on ``(n,)``.
-        stick: those that stick when they are ``(n,)``.
+        own: normal equations.
+        frame: tangential directions and relative motions.
+        of_friction: active contactors with friction ``(n,)``.
+        stick: contactors that stick if they are frictional ``(n,)``.
         directions: of slip ``(n, gdim)``.
-        slope: by how much the limit of friction grows with the multiplier across the target ``(n,)``.
+        slope: derivative of the friction limit by the normal multiplier ``(n,)``.
         normal: of the contactors ``(n, gdim)``.
-        pointwise: whether contactors that stick stand on their anchors, so that both are followed by the same weights.
-        keeps_ties: whether contactors that stick follow by the weights of now what they have followed since the last step.
+        pointwise: whether sticking contactors are at their anchors, so that both have the same weights.
+        keeps_ties: whether the weights of sticking contactors are unchanged since the last step.
     """
     comm, g = frame.ties.config.comm, normal.shape[1]
     across = np.flatnonzero(own.kind == NORMAL)
@@ -63,7 +63,7 @@ def with_friction(
     slipping = of_friction & ~stick
     tilt = np.where(slipping[:, None], -slope[contactor, None] * directions[contactor], 0.0)
     slips = reduced(comm, bool(tilt.any()), op=MPI.LOR)
-    # rows of contactors that stick are symmetric where they follow by the weights of now
+    # trial and test rows of sticking contactors are equal if they have the current weights
     if own.trial is not test or not (pointwise or (keeps_ties and not slips)):
         trial = with_those_along(own.trial, frame.ties if pointwise else frame.way)
     if slips:

@@ -92,7 +92,7 @@ class Sliding:
         """Parameter of the law at the contactors ``(n,)``, 0 without friction."""
         return self.limits.value
 
-    # -- where the contactors stand --------------------------------------------------------------------------------------
+    # -- placement of contactors -----------------------------------------------------------------------------------------
 
     def place(self, kinematics: Kinematics, state: FrictionState) -> None:
         """Find the anchors, or the relative motions of contactors, in the current configuration (collective)."""

@@ -1,4 +1,4 @@
-"""Coulomb's law: friction up to a coefficient times the force along the normal, and up to a stress or a force if one is given."""
+"""Coulomb's law: friction up to a coefficient times the normal force, and up to a given stress or force."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from uem_dolfinx.errors import InputError
 
 @dataclass(frozen=True, init=False)
 class Coulomb:
-    """A contactor slips where the force along the target reaches ``mu lam``, or ``limit A`` or ``force`` if that is less.
+    """A contactor slips if the tangential force reaches ``mu lam``, or ``limit A`` or ``force`` if these are smaller.
 
     Args:
         field: the coefficient mu, a number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``.
-        limit: the largest stress that friction bears, a force per reference area, such as the yield stress in shear of the softer
-            body; None for no limit.
-        force: the largest force of friction on each contactor, for contactors that are points; None for no limit.
+        limit: the largest friction stress, a force per reference area, such as the shear yield stress of the softer body; None for
+            no limit.
+        force: the largest friction force on each contactor, for contactors given as points; None for no limit.
 
     Raises:
-        InputError, InputTypeError: if ``limit`` or ``force`` is no positive number, or both are given.
+        InputError, InputTypeError: if ``limit`` or ``force`` is not a positive number, or both are given.
     """
 
     field: float | Callable[..., npt.ArrayLike]
@@ -51,7 +51,7 @@ class Coulomb:
         return self.force is not None
 
     def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
-        """The less of ``mu lam`` and the limit, and mu or 0; see ``FrictionLaw``."""
+        """The minimum of ``mu lam`` and the limit, and mu or 0; see ``FrictionLaw``."""
         if self.most is None and self.force is None:
             return value * lam, value
         most = np.full_like(lam, self.force) if self.most is None else self.most * area

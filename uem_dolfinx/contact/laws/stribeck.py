@@ -1,4 +1,4 @@
-"""Friction that falls, or grows, with the speed of slip: static and kinetic coefficients, and what leads from one to the other."""
+"""Friction that depends on the slip speed, with static and kinetic coefficients and a transition between them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Stribeck:
     that is found continues to slip.
 
     Args:
-        field: the static coefficient, a number, or a function as of ``Contact``; where it is 0 there is no friction.
+        field: the static coefficient, a number, or a function as for ``Contact``; no friction where it is 0.
         kinetic: coefficient at high speed.
-        velocity: speed at which all but ``1/e`` of the difference has gone, or 0.
+        velocity: speed at which the difference has decreased to ``1/e``, or 0.
         viscous: growth with the speed, one over a speed.
 
     Raises:
@@ -48,7 +48,7 @@ class Stribeck:
 
     @property
     def timed(self) -> bool:
-        """Whether mu depends on how fast contactors slip, rather than on whether they do."""
+        """Whether mu depends on the slip speed, not only on stick or slip."""
         return self.velocity > 0.0 or self.viscous > 0.0
 
     def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""A parameter of a law of friction that follows the temperature of what touches, as users declare it."""
+"""User input of a friction parameter that depends on the temperature of the surfaces in contact."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from uem_dolfinx.arrays import Array
 class OfTemperature(given.Sealed):
     """A coefficient of friction, or another law's first parameter, that is a function of the temperature at the contactors.
 
-    The temperature that counts is the mean of the contactor's and of that which it faces on the target; against a rigid surface the mean
-    with the ``temperature`` of the contact's ``heat``, or the contactor's own where there is none. It is that of the same iteration as
-    the positions of the contactors: once a step has converged, friction is that of its temperatures.
+    This temperature is the mean of the contactor and of the opposite point of the target. On a rigid surface it is the mean with
+    the ``temperature`` of the contact's ``heat``, or without it the contactor's temperature. It belongs to the same iteration as
+    the positions, so that friction of a converged step is consistent with its temperatures.
 
     Args:
-        f: function of the reference places ``(3, n)``, the load factor, in dynamics the time, and the temperatures ``(n,)``, which returns
-            ``(n,)`` numbers, 0 or positive, or one for all. Temperatures on the way to equilibrium may be far off.
+        f: function of the reference positions ``(3, n)``, the load factor, in dynamics the time, and the temperatures ``(n,)``,
+            which returns ``(n,)`` numbers, 0 or positive, or one for all. During iterations T may be far off.
         field: number of the part of the mixed space that is the temperature, scalar Lagrange of the displacement's degree or less.
 
     Raises:
-        InputTypeError: if ``f`` is no function, or ``field`` no whole number.
+        InputTypeError: if ``f`` is not a function, or ``field`` not an integer.
     """
 
     def __init__(self, f: Callable[[Array, float, Array], npt.ArrayLike], *, field: int):
@@ -36,5 +36,5 @@ class OfTemperature(given.Sealed):
         return self.f(x, t, T)
 
     def at(self, t: float) -> OfTemperature:
-        """Its value at a load factor or time, from then on."""
+        """The same function with a fixed load factor or time."""
         return OfTemperature(lambda x, _, T: self.f(x, t, T), field=self.field)

@@ -13,9 +13,9 @@ from uem_dolfinx.arrays import Array
 
 @dataclass(frozen=True)
 class Tresca:
-    """A contactor slips where the force along the target reaches ``tau A``, wherever it touches.
+    """A contactor in contact slips if the tangential force reaches ``tau A``.
 
-    The united matrix is symmetric: test rows are those of P.
+    The matrix of the constrained system is symmetric, since test rows are the rows of P.
 
     Args:
         field: the stress tau, a force per reference area: a number, or a function of place that is given reference points ``(3, n)`` and

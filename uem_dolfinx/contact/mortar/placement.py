@@ -161,7 +161,7 @@ class MortarKinematics(PlacedOnTarget):
         moved = state.active & ~rows.covered & (state.facet >= 0) & (state.facet != number)
         return self, replace(state, facet=number, changes=state.changes + moved), False
 
-    # -- what decides ----------------------------------------------------------------------------------------------------
+    # -- deciding quantities ---------------------------------------------------------------------------------------------
 
     @cached_property
     def ends(self) -> Ends:

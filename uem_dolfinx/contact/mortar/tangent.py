@@ -60,7 +60,7 @@ class SegmentPoints:
         y: of the target facets, pair by pair ``(k, nt, gdim)``.
         sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
         shape_operator: second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh.
-        radius: of the circles that points of axisymmetric bodies stand for, which their weights hold ``(q,)``; None of others.
+        radius: of the circles of points in axisymmetry, included in their weights ``(q,)``; None otherwise.
         offsets: of the gap at the contactor facets' nodes ``(m, nc)``; None for none.
     """
 

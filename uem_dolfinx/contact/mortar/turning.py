@@ -28,8 +28,8 @@ class Frictional:
     Attributes:
         which: places among the contactors, ascending ``(k,)``.
         normal: directions of their equations ``(k, gdim)``.
-        tau: friction, handed on by the weights that they follow other nodes with ``(k, gdim)``.
-        slips: those that slip, whose friction grows with the force across the target ``(k,)``.
+        tau: friction, transmitted by the weights of followed nodes ``(k, gdim)``.
+        slips: slipping contactors, whose friction depends on the normal force ``(k,)``.
     """
 
     which: Ints
@@ -201,7 +201,7 @@ def turning(
 
 
 def _places(facets: Ints, which: Ints) -> Ints:
-    """Places in ``facets (m, nc)`` of facets told by the same nodes ``(p, nc)``."""
+    """Indices in ``facets (m, nc)`` of facets with the same nodes ``(p, nc)``."""
     _, number = np.unique(np.concatenate([facets, which]), axis=0, return_inverse=True)
     place = np.zeros(len(number), dtype=np.int64)
     place[number[: len(facets)]] = np.arange(len(facets))

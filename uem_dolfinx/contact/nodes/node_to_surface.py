@@ -204,7 +204,7 @@ class NodalKinematics(PlacedOnTarget):
         state, entered = self.of.concave_edges.follow(self.nearest, left, self.points, state)
         return replace(self, left=left), state, bool(left.any()) or entered
 
-    # -- what decides ----------------------------------------------------------------------------------------------------
+    # -- deciding quantities ---------------------------------------------------------------------------------------------
 
     @cached_property
     def ends(self) -> Ends:

@@ -85,7 +85,7 @@ class Interface(Told):
         self.redundant = self.reserved = self._redundant = self._reserved = none
         self.initial_overlap, self.mutual = 0.0, False
 
-    # -- where the contactors stand --------------------------------------------------------------------------------------
+    # -- placement of contactors -----------------------------------------------------------------------------------------
 
     def project(self) -> None:
         """Project the contactors onto the target in the current configuration (collective).
@@ -295,7 +295,7 @@ class Interface(Told):
             apart = self.trial.active & (self.gap > active_set.TOUCHING * self.config.size)
             self._set_active(replace(self.trial, active=self.trial.active & ~apart))
 
-    # -- what the united system gets -------------------------------------------------------------------------------------
+    # -- equations and forces --------------------------------------------------------------------------------------------
 
     def equations(self) -> Constraints:
         """Equations of the contactors that are or may become active, then of tied contactors (collective).

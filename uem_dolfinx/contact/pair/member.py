@@ -105,7 +105,7 @@ class Member(Interface):
             return here
         return max(here, float(whole.friction.distances(whole.trial, whole.redundant)[self._rows].max(initial=0.0)))
 
-    # -- where the contactors stand --------------------------------------------------------------------------------------
+    # -- placement of contactors -----------------------------------------------------------------------------------------
 
     def project(self) -> None:
         """Project the contactors of all contacts onto their targets (collective)."""
@@ -159,7 +159,7 @@ class Member(Interface):
         parts["which"] = parts["which"] - self._rows.start
         return replace(corners, **parts)
 
-    # -- what is set between steps ---------------------------------------------------------------------------------------
+    # -- changes between steps -------------------------------------------------------------------------------------------
 
     def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
         """Restore a state from ``memory``; call ``project`` afterwards, with bodies and target at their positions of that time."""

@@ -1,1 +1,1 @@
-"""What a discretisation supplies, and what its contactors are: the seam between a pair and its discretisation."""
+"""The interface between a contact pair and its discretisation, and the states of contactors."""

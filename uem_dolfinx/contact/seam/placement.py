@@ -227,7 +227,7 @@ class Kinematics(Protocol):
     def follow(self, state: PairState) -> tuple[Kinematics, PairState, bool]:
         """Follow contactors from facet to facet, into and out of corners; whether equations change on this rank (collective)."""
 
-    # -- what decides ----------------------------------------------------------------------------------------------------
+    # -- deciding quantities ---------------------------------------------------------------------------------------------
 
     @property
     def ends(self) -> Ends:

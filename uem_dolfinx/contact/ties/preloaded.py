@@ -63,7 +63,7 @@ class Preloaded(Tie):
     # -- the axis and the leading row ------------------------------------------------------------------------------------
 
     def unite(self, state: PairState, projection: Projection, off: Bools, which: Bools | None = None) -> PairState:
-        """As of ``Tie`` (collective).
+        """See ``Tie`` (collective).
 
         Raises:
             InputError: if the axis lies in the section.
@@ -209,7 +209,7 @@ class Preloaded(Tie):
         assert self.rows is not None
         return self.rows.has
 
-    # -- what is told, and from step to step -----------------------------------------------------------------------------
+    # -- results, and from step to step ----------------------------------------------------------------------------------
 
     def carried(self, state: PairState) -> float:
         """Force in the section in a state, positive in tension (collective)."""
@@ -235,7 +235,7 @@ class Preloaded(Tie):
         return super().to_checkpoint() | {"locked": np.full(n, self.locked), "opening": np.full(n, opening)}
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]], off: Bools) -> None:
-        """As of ``Tie`` (collective)."""
+        """See ``Tie`` (collective)."""
         locked, opening = np.array(kept["locked"]), np.array(kept["opening"])
         self.locked = bool(reduced(self.config.comm, bool(locked.any()), op=MPI.LOR))
         self.opening = float(reduced(self.config.comm, float(opening.max(initial=-np.inf)), op=MPI.MAX))

@@ -40,12 +40,12 @@ class TiedConstraints(Constraints):
 
     @property
     def contact(self) -> Constraints:
-        """As of ``Constraints``."""
+        """See ``Constraints``."""
         return self.first
 
     @property
     def tied(self) -> Bools:
-        """As of ``Constraints``."""
+        """See ``Constraints``."""
         return np.arange(len(self)) >= len(self.first)
 
     @classmethod
@@ -195,7 +195,7 @@ class Tie:
         lam, nodal = (np.where(tied, 0.0, force) for force in (state.lam, state.nodal))
         return replace(state, active=state.active & ~tied, lam=lam, nodal=nodal, friction=f)
 
-    # -- where the contactors stand --------------------------------------------------------------------------------------
+    # -- placement of contactors -----------------------------------------------------------------------------------------
 
     def begin_placement(self) -> bool:
         """Bodies have moved: whether contactors must be projected. If all are tied, this is done once a step, for results."""
@@ -231,15 +231,15 @@ class Tie:
         return way
 
     def kept_gaps(self) -> Array:
-        """As of ``Told``."""
+        """See ``Told``."""
         spacers = None if self.rows is None else self.rows.spacers
         return np.zeros(0) if spacers is None else spacers.height
 
     def torn(self) -> Array:
-        """As of ``Told``."""
+        """See ``Told``."""
         return np.linalg.norm(np.where(self._left_out, self.apart(), 0.0), axis=1)
 
-    # -- what the united system gets -------------------------------------------------------------------------------------
+    # -- equations and forces --------------------------------------------------------------------------------------------
 
     def join(self, contact: Constraints) -> Constraints:
         """Equations of contact, followed by those of tied contactors (collective)."""
@@ -299,10 +299,10 @@ class Tie:
         return False
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
-        """As of ``Told``."""
+        """See ``Told``."""
         return None
 
-    # -- what is told ----------------------------------------------------------------------------------------------------
+    # -- results ---------------------------------------------------------------------------------------------------------
 
     def pressing(self, state: PairState, n: Array, lam: Array, tau: Array) -> tuple[Array, Array]:
         """See ``Told``; from contact forces and normals ``(n, gdim)``, with tied contactors, which may be in tension (collective)."""

@@ -1,1 +1,1 @@
-"""What contacts warn of while steps are taken."""
+"""Checks and warnings of contacts after steps."""
