@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from gradient_scenes import dot, move, wave
+from gradient_scenes import control_of, dot, drag_anew, wave
 from helpers import blocks, highest, refused
 
 import uem_dolfinx as uem
@@ -31,29 +31,22 @@ def ball():
 
 
 def dragged(target=None, moves=False, general=False, equation=False, joined=False, **how):
-    """A block pressed onto another or onto a rigid surface and dragged, on 3 steps; ``history`` takes the present ``values``."""
+    """A block pressed onto another or onto a rigid surface and dragged, on 3 steps; see ``gradient_scenes.dragged``."""
     b = blocks(COMM, "triangle", 3, 4, overhang=0.25)
     mesh, v = b.scene.mesh, ufl.TestFunction(b.V)
-    E, top = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.zeros(2))
+    E, top = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.array([0.05, -0.05]))
     F = uem.NeoHooke(E, 0.3, kind="plane_strain").residual(b.u, v) * ufl.dx
     push = fem.dirichletbc(top, fem.locate_dofs_topological(b.V, 1, b.top.entities), b.V)
-    values = {
-        "E": np.array(1.0),
-        "top": np.array([0.05, -0.05]),
-        "offset": np.array(0.0),
-        "place": np.zeros(2),
-        "turn": np.array(0.0),
-    }
-    values["more"] = np.array(0.0)
+    # more is added to a friction that is a function of place
+    values = {"offset": np.array(0.0), "place": np.zeros(2), "turn": np.array(0.0), "more": np.array(0.0)}
     if isinstance(how.get("friction"), float):
         values["friction"] = np.array(how.pop("friction"))
     s = SimpleNamespace(
         b=b, E=E, top=top, X=ufl.SpatialCoordinate(mesh), values=values, J=(ufl.inner(b.u, b.u) + E * b.u[0] * b.u[1]) * ufl.dx
     )
 
-    def history():
+    def solve():
         b.u.x.array[:] = 0.0
-        E.value, top.value[:] = float(values["E"]), values["top"]
         surface, load = b.low if target is None else target(), None
         if target is not None:
             # the place where it starts is changed with all others
@@ -81,36 +74,21 @@ def dragged(target=None, moves=False, general=False, equation=False, joined=Fals
         s.fields = [part.status for part in (s.contact.parts if general else [s.contact])]
         return history
 
-    s.history = history
+    s.solve = solve
     return s
 
 
 def deviation(s, name):
     """Derivative along a change of one control, over all steps, over central differences of the runs, less 1."""
-    control = {"E": s.E, "top": s.top, "X": s.X}
-    found = s.history()
-    (by,) = found.gradient(s.J, [control.get(name) or uem.ContactParameter(s.contact, "friction" if name == "more" else name)])
+    found = s.solve()
+    (by,) = found.gradient(s.J, [control_of(s, s.contact, "friction" if name == "more" else name)])
     status = [np.array(f.x.array) for f in s.fields]
-    if name == "X":
-        change = wave(s.b.V, 1.0)
-        slope = dot(by, change)
-    else:
-        before = s.values[name]
-        change = np.linspace(1.0, 0.6, before.size).reshape(before.shape)
-        slope = float(np.sum(by * change))
+    change = wave(s.b.V) if name == "X" else np.linspace(1.0, 0.6, np.size(by)).reshape(np.shape(by))
+    slope = dot(by, change) if name == "X" else float(np.sum(by * change))
 
     def functional(h):
-        if name == "X":
-            move(s, change, h)
-        else:
-            s.values[name] = before + h * change
-        s.history()
+        _, J = drag_anew(s, name, change, h)
         assert all(np.array_equal(f.x.array, then) for f, then in zip(s.fields, status)), f"{name} changes the active set"
-        J = uem.integrate(s.J)
-        if name == "X":
-            move(s, change, -h)
-        else:
-            s.values[name] = before
         return J
 
     h = 1e-5
@@ -166,13 +144,12 @@ REFUSED = {
 def test_refused(what):
     how, name, words = REFUSED[what]
     s = dragged(**how)
-    control = {"E": s.E, "X": s.X}[name]
-    refused(uem.InputError, words, lambda: s.history().gradient(s.J, control))
+    refused(uem.InputError, words, lambda: s.solve().gradient(s.J, getattr(s, name)))
 
 
 def test_a_ball_turns_about_its_centre():
     """A turn of a ball about its centre does nothing where no friction takes it along."""
     s = dragged(target=ball, moves=True)
-    found = s.history()
+    found = s.solve()
     by_turn, by_place = found.gradient(s.J, [uem.ContactParameter(s.contact, name) for name in ("turn", "place")])
     assert highest(COMM, np.abs(by_turn)) <= 1e-10 * highest(COMM, np.abs(by_place))

@@ -43,6 +43,7 @@ from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
@@ -232,7 +233,7 @@ class Linearised:
 
     def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
         """Derivative of the forces of contacts with these numbers with the displacement, with the opposite sign (collective)."""
-        return curvature_of([p for k in which if (p := self.problem.pairs[k]).asked], self.config.unknowns.vector(), True, False)
+        return curvature_of(in_question([self.problem.pairs[k] for k in which]), self.config.unknowns.vector(), True, False)
 
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``a = Q mu`` of the adjoint problem under forces (collective)."""

@@ -17,6 +17,8 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.mortar.placement import Contactors
+from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_expression, check_functional, check_parts
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -359,7 +361,7 @@ def _check_shape(problem: UnitedProblem) -> None:
             "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"
         )
     for contact in problem.contacts:
-        if callable(contact.coupling):
+        if not isinstance(contact.pair.discretisation, (NodeToSurface, Contactors)):
             raise InputError(
                 f"contact '{contact.name}': there is no gradient by the shape with a discretisation of one's own, whose rows may change "
                 "with the shape in ways that are not known: take differences of runs"

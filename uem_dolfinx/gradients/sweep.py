@@ -25,6 +25,7 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
 from uem_dolfinx.errors import InputError
@@ -225,13 +226,13 @@ class LinearisedStep(Linearised):
         for pair, own in zip(pairs, slopes):
             pair.trial = pair.trial if own is None else own.without_stuck()
         try:
-            curvature = curvature_of(asked := [pair for pair in pairs if pair.asked], like, any(self._slopes), False)
+            curvature = curvature_of(in_question(pairs), like, any(self._slopes), False)
         finally:
             for pair, state in zip(pairs, states):
                 pair.trial = state
         if self.config.gdim == 2 or not any(slopes):
             return curvature
-        turned, _ = slip_terms(asked, like)
+        turned, _ = slip_terms(in_question(pairs), like)
         leaning = contact_curvature([part for own in slopes if own is not None for part in own.leaning()], like)
         return together(together(curvature, turned), leaning)
 

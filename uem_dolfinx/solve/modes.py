@@ -89,13 +89,8 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         bodies.assemble()
         bodies.tangent.update()
         # no supports: floating bodies are free
-        rows = make_rows(
-            system.over_constraints,
-            pairs := in_question(system.pairs),
-            lambda *_: bodies.free_rows,
-            0.0 * bodies.prescribed,
-            system.linear,
-        )
+        pairs = in_question(system.pairs)
+        rows = make_rows(system.over_constraints, pairs, lambda *_: bodies.free_rows, 0.0 * bodies.prescribed, system.linear)
         like, M = config.unknowns.vector(), config.in_rows(mass.M)
         curvature = curvature_of(pairs, like, False, False) if system.consistent_tangent else None
         P = rows.frictionless

@@ -160,7 +160,8 @@ class Rows:
         """Equations of each of these pairs; empty for pairs without equations."""
         known = {id(pair): own for pair, own in zip(self.pairs, self.equations)}
         none = np.zeros(0, np.int64)
-        return [known.get(id(pair), pair.kinematics.gap_rows.select(none, pair.trial.active)) for pair in pairs]
+        known |= {id(p): p.kinematics.gap_rows.select(none, p.trial.active) for p in pairs if id(p) not in known}
+        return [known[id(pair)] for pair in pairs]
 
 
 @dataclass(frozen=True)

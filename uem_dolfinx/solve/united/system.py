@@ -173,7 +173,7 @@ class BodySystem:
     def residual(self) -> PETSc.Vec:
         """Forces of the bodies minus loads of contacts and friction that is independent of the normal force (collective)."""
         F = self.bodies.residual
-        for nodes, forces in filter(None, (*known_forces(pairs := self.near), *(pair.applied_forces() for pair in pairs))):
+        for nodes, forces in filter(None, (*known_forces(self.near), *(pair.applied_forces() for pair in self.near))):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
         for heat in self._heats:
             F.array[:] += heat.residual()
@@ -290,10 +290,9 @@ class BodySystem:
             near = max(PREDICTED, left) * way
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
-            gaps, violated = [pair.gap for pair in self.pairs], [Violations.none(len(pair.nodes)) for pair in self.pairs]
-            for pair in self.near:
-                k = self.pairs.index(pair)
-                gaps[k] = pair.predicted(increment)
+            gaps = [pair.predicted(increment) if pair.asked else pair.gap for pair in self.pairs]
+            violated = [Violations.none(len(pair.nodes)) for pair in self.pairs]
+            for k, pair in ((k, pair) for k, pair in enumerate(self.pairs) if pair.asked):
                 along = pair.stiffness_across(self.bodies.stiffness)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated[k] = pair.violated(gaps[k], forces[k], along, least, near, self._swept, moved)
