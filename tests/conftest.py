@@ -33,6 +33,7 @@ pytest.register_assert_rewrite(
 from helpers import complementary, coulomb, highest
 
 import uem_dolfinx as uem
+from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.solve.bodies.norms import first
 from uem_dolfinx.solve.united.system import BodySystem
 
@@ -168,10 +169,11 @@ def lever(contact: uem.Contact) -> float:
     """Bound on the moment that a contact leaves behind: friction of mortar acts where gaps vanish in the mean, not everywhere.
 
     Friction and corners push at the foot, from which an offset holds contactors off, and shear of a preloaded section acts across its
-    opening.
+    opening. Forces at a seam are those of both sides together.
     """
     pair = contact.pair
-    if isinstance(contact, uem.Preload):
+    cut = isinstance(pair.discretisation, Contactors) and pair.discretisation.elimination.seam.any
+    if isinstance(contact, uem.Preload) or cut:
         return np.inf
     sideways = pair.frictional or pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
     if pair.projection.offset is not None and sideways:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.algebra.dependent import IndependentEquations, _eliminate, _solve
+from uem_dolfinx.algebra.dependent import IndependentEquations, Rank, _eliminate, _solve
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DEPENDENT
@@ -223,6 +223,30 @@ def test_rows_of_which_none_can_be_eliminated(m):
 
 
 # -- two-pass ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("copies", [2, 3])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_equal_rows_have_equal_forces(copies, scale):
+    """Contactors that firm equations make one, under any forces: equal parts, and the rest of each node's force is the equations'."""
+    rng = np.random.default_rng(copies)
+    n, g = copies + 1, 2
+    normal = np.array([0.6, 0.8])
+    A = np.zeros((2 * copies - 2 + copies, n, g))
+    for i in range(1, copies):
+        for c in range(g):
+            A[2 * (i - 1) + c, [0, i], c] = scale * np.array([-1.0, 1.0])
+    own = np.arange(2 * copies - 2, len(A))
+    A[own, np.arange(copies)] = normal
+    A[own, copies] = -normal
+    rank = np.where(np.isin(np.arange(len(A)), own), Rank.WITHIN, Rank.FIRM)
+    group = _eliminate(A.copy(), np.zeros(len(A)), np.ones((n, g), dtype=bool), np.arange(n), np.arange(len(A)), rank)
+    lam = group.shares @ rng.normal(size=len(group.independent))
+    assert lam[own] == pytest.approx(np.full(copies, lam[own].mean()), rel=1e-10)
+    rows = np.zeros((len(group.independent), n, g))
+    rows[np.arange(len(rows)), group.independent.node] = group.independent.direction
+    np.add.at(rows, (group.independent.row, group.independent.followed), -group.independent.coefficients)
+    assert np.einsum("mk,mng->kng", group.shares, A) == pytest.approx(rows, abs=1e-12)
 
 
 @pytest.mark.parametrize("cell", CELLS)

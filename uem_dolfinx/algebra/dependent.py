@@ -269,7 +269,7 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
     k, pivot, direction = _pivots(A, h, across, free, rest, rank)
     shares: Array = np.zeros((m, 0))
     if len(k):
-        shares = _shares(movable, (A[k] * free).reshape(len(k), free.size))
+        shares = _shares(movable, (A[k] * free).reshape(len(k), free.size), rank == Rank.FIRM)
     terms = A[k]
     # the rest of the pivot's block is orthogonal to the eliminated direction, and followed like any other node
     terms[np.arange(len(k)), pivot] -= direction
@@ -336,8 +336,25 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
     return k, pivot, direction
 
 
-def _shares(given: Array, independent: Array) -> Array:
-    """Combinations of the given rows ``(m, n)``, of least norm, that equal the independent rows ``(k, n)``: ``(m, k)``."""
+def _shares(given: Array, independent: Array, firm: Bools) -> Array:
+    """Combinations of the given rows ``(m, n)`` that equal the independent rows ``(k, n)``: ``(m, k)``.
+
+    Their norm is the least in the rows that are not ``firm (m,)``: contactors with equal rows have equal parts of the force.
+    """
+    from scipy.linalg import qr
+
+    shares = np.zeros((len(given), len(independent)))
+    if firm.any() and not firm.all():
+        across = qr(given[firm].T, mode="full", check_finite=False)[0][:, firm.sum() :]
+        shares[~firm] = _least(given[~firm] @ across, independent @ across)
+        independent = independent - shares[~firm].T @ given[~firm]
+        shares[firm] = _least(given[firm], independent)
+        return shares
+    return _least(given, independent)
+
+
+def _least(given: Array, independent: Array) -> Array:
+    """The combinations of least norm of given rows ``(m, n)`` that are closest to independent rows ``(k, n)``: ``(m, k)``."""
     from scipy.linalg import lstsq
 
     # a complete orthogonal factorisation is ten times as fast as a singular value decomposition

@@ -63,7 +63,7 @@ class Mortar(Contactors):
         # distinguishes equal nodes, independent of the partition
         nn = surface.dofs.shape[1]
         code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
-        self._code = config.to_owners(surface.dofs.ravel(), code.ravel()) % 1.0
+        self._code = self.elimination.seam.sums(config.to_owners(surface.dofs.ravel(), code.ravel())) % 1.0
         #: Rows of the last placement, with the search and the states of contactors that they depend on; a search returns the same
         #: object while no node moves.
         self._united: tuple[Projection, Ints, WeightedRows] | None = None
@@ -119,34 +119,38 @@ class Mortar(Contactors):
 
     def _follow(self, rows: WeightedRows, nearest: Projection) -> WeightedRows:
         """The kept rows in the current configuration (collective)."""
-        eq, n = rows.equations, self.config.n_owned
+        n = self.config.n_owned
         if self.target.n_nodes:
-            gap = self._along(eq, self.config.x[:n])
+            gap = self._along(rows, self.config.x[:n])
         else:
             assert self.anchor is not None
-            eq = self._turned(eq)
+            rows = self._turned(rows)
+            eq = rows.equations
             # change of height as a displacement along the rows
             lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
             way = np.zeros((n, self.config.gdim))
             way[self.nodes] = ((nearest.height - self.anchor.height) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
-            gap = eq.gap + self._along(eq, way)
+            gap = eq.gap + self._along(rows, way)
         if self.offset is not None:
             gap = gap - self._weighted_offset(rows)
-        moved = replace(eq, gap=gap)
-        return replace(rows, equations=moved, plain=moved, normal=eq.direction)
+        moved = replace(rows.equations, gap=gap)
+        return replace(rows, equations=moved, plain=moved, normal=moved.direction)
 
-    def _along(self, equations: UnitingEquations, values: Array) -> Array:
-        """Left sides of equations for the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
-        return GapRows.along_normals(self.config, equations, np.ones(len(equations)), self.free).along(values)
+    def _along(self, rows: WeightedRows, values: Array) -> Array:
+        """Left sides of kept rows for the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
+        eq, seam = rows.equations, self.elimination.seam
+        found = GapRows.along_normals(self.config, eq, np.ones(len(eq)), self.free).along(values)
+        return np.asarray(found + seam.apart(self.nodes, rows.side, values).sum(axis=1))
 
-    def _turned(self, equations: UnitingEquations) -> UnitingEquations:
+    def _turned(self, rows: WeightedRows) -> WeightedRows:
         """Kept rows, rotated with a rigid target."""
         now, then = self.target.motion, self._kept_at
         if now is then:
-            return equations
+            return rows
         still = Motion.none(self.config.gdim)
         Q = (now or still).Q @ (then or still).Q.T
-        return replace(equations, direction=equations.direction @ Q.T, coefficients=equations.coefficients @ Q.T)
+        eq = replace(rows.equations, direction=rows.equations.direction @ Q.T, coefficients=rows.equations.coefficients @ Q.T)
+        return replace(rows, equations=eq, side=rows.side @ Q.T)
 
     # -- rows ------------------------------------------------------------------------------------------------------------
 
@@ -179,8 +183,7 @@ class Mortar(Contactors):
         if offsets is not None:
             offset = np.einsum("qa,qa->q", phi, offsets[pairs[segments.pair]])
         covered = Covered.of(segments, b, N, pairs, self.shares(planes.size, x[facets]), offset)
-        part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
-        ratio = part / np.where(full > 0, full, 1.0)
+        ratio = self.covered_part(dofs, covered)[1]
         duals = dual_functions(covered, self.precedence(ratio[dofs], dofs), before[facets])
         other = self.target.shape if isinstance(self.target, MeshTarget) else None
         at = SegmentPoints(
@@ -189,6 +192,12 @@ class Mortar(Contactors):
         )  # fmt: skip
         rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
         return replace(rows, facing=facing)
+
+    def covered_part(self, dofs: Indices, covered: Covered) -> tuple[Array, Array]:
+        """Covered area of each local node's facets ``dofs (m, nn)``, and its part of their area ``(n_local,)`` (collective)."""
+        areas = (self.config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
+        part, full = map(self.elimination.seam.sums, areas)
+        return part, part / np.where(full > 0, full, 1.0)
 
     def told(self, facets: Ints) -> Array | None:
         """Visibility keys of contactor facets ``(m,)``: ``(m, k)``; None if they may touch all target facets."""
@@ -213,9 +222,9 @@ class Mortar(Contactors):
         at = rows.points
         coefficients = at.duals.C @ self.basis.T
         weighted = np.einsum("mij,mj->mi", coefficients, values)
-        own = np.einsum("mii,mg->mig", coefficients, at.planes.normal)
+        own = np.einsum("mij,mij,mg->mig", coefficients, self.elimination.seam.same(at.nodes), at.planes.normal)
         parts = np.concatenate([weighted[..., None], own], axis=2).reshape(weighted.size, 1 + self.config.gdim)
-        total = self.config.add_at_owners(at.nodes.ravel(), parts)[self.nodes]
+        total = self.elimination.total(at.nodes.ravel(), parts)
         return total[:, 0], np.where(rows.covered, np.linalg.norm(total[:, 1:], axis=1), 1.0)
 
     def with_variation(self, kinematics: MortarKinematics) -> MortarKinematics:
@@ -291,17 +300,19 @@ class Mortar(Contactors):
         followed = (A[e] @ at.covered.N)[..., None]
         on_target = followed * normal[e][:, None, None]
         area, gap = C.sum(axis=2), np.einsum("mij,mj->mi", A, at.covered.G)
+        sharing, same = self.elimination.seam.sharing, self.elimination.seam.same(own)
+        itself = np.einsum("mij,mij->mi", coefficients, same)
         f, i = np.nonzero(area > 0)
-        values = np.column_stack([on_facet[f, i, i], gap[f, i], area[f, i, None] * normal[f]])
-        total = config.add_at_owners(own[f, i], values)[self.nodes]
+        values = np.column_stack([itself[f, i, None] * normal[f], gap[f, i], area[f, i, None] * normal[f]])
+        total = self.elimination.total(own[f, i], values)
         direction, gap, size = total[:, : config.gdim], total[:, config.gdim], np.linalg.norm(total[:, config.gdim + 1 :], axis=1)
         length = np.linalg.norm(direction, axis=1)
         is_covered = length > 0
         scale = np.where(is_covered, length, 1.0)
         direction = np.where(is_covered[:, None], direction / scale[:, None], nearest.normal)
         # rows contain other nodes of their own facets if these have no function of their own, and nodes of the target
-        other = ~np.eye(own.shape[1], dtype=bool)
-        terms = [terms_of(own, own, -on_facet, other & (coefficients != 0)), terms_of(own[e], at.opposite, on_target)]
+        other = ~same & (coefficients != 0)
+        terms = [terms_of(own, own, -on_facet, other), terms_of(own[e], at.opposite, on_target)]
         row, term, value = self.elimination.at_owners(terms, scale)
         # other contactors have node-to-surface rows
         alone = np.flatnonzero(~is_covered)
@@ -310,7 +321,8 @@ class Mortar(Contactors):
         value = np.concatenate([value, nearest.weights[alone][k, a, None] * nearest.normal[alone][k]])
         gap = np.where(is_covered, gap / scale, nearest.gap)
         variation: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, config.gdim)))
-        length, parts = np.ones(n), np.einsum("mii,mg->mig", coefficients, normal)
+        side = self.elimination.sides(own, on_facet) / scale[:, None]
+        length, parts = np.ones(n), itself[:, :, None] * normal[:, None]
         plain_parts = parts
         plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
         if self.sliding == "finite" and reduced(config.comm, bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
@@ -323,13 +335,13 @@ class Mortar(Contactors):
             along = self.elimination.of_themselves(plain, variation)
             slope = np.linalg.norm(along, axis=1)
             pushed = np.linalg.norm([plain_parts[f, i], parts[f, i]], axis=2).T
-            pushed = config.add_at_owners(own[f, i], pushed)[self.nodes]
+            pushed = self.elimination.total(own[f, i], pushed)
             taken = np.bincount(variation[0], minlength=n) > 0
             push = np.where(is_covered, np.where(taken, pushed[:, 1], pushed[:, 0]) / scale, 1.0)
             frictionless = along / slope[:, None]
-            whole = config.add_at_owners(own[f, i], coefficients[f, i, i, None])[self.nodes, 0]
+            whole = self.elimination.total(own[f, i], itself[f, i, None])[:, 0]
             means = [
-                terms_of(own, own, -coefficients[..., None], other & (coefficients != 0)),
+                terms_of(own, own, -coefficients[..., None], other),
                 terms_of(own[e], at.opposite, followed),
             ]
             whole = np.where(is_covered, whole, 1.0)
@@ -337,7 +349,8 @@ class Mortar(Contactors):
             near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
             weights = np.concatenate([r, alone[k]]), np.concatenate([t, near[0]]), np.concatenate([w[:, 0], near[1]])
         return WeightedRows(
-            equations, length, plain, at, facets, is_covered, ratio, size, stretch, share, weights, frictionless, slope, push, parts, whole,
+            sharing, side, equations, length, plain, at, facets, is_covered, ratio, size / sharing, stretch, share, weights,
+            frictionless, slope, push, parts, whole,
         )  # fmt: skip
 
     def begin_step(self) -> None:

@@ -42,7 +42,7 @@ class Contactors(OnTarget):
         super().__init__(config, nodes, target, **how)
         self.surface = surface
         self.basis: Basis = basis_of(surface.shape)
-        self.elimination = Elimination(config, nodes)
+        self.elimination = Elimination(config, nodes, config.seams)
         self.remembered = Remembered(config, nodes, surface)
         self.faced: Ints = np.zeros((0, 2), np.int64)
 
@@ -88,7 +88,7 @@ class Contactors(OnTarget):
         """Current areas ``size (k,)`` of facets around contactors over their reference areas ``(n,)`` (collective)."""
         dofs, X = self.surface.dofs[facets], self.config.X[self.surface.dofs]
         shares = self.shares(size, self.surface.x[facets]), self.shares(self.sizes(X), X)[facets]
-        now, then = (self.config.to_owners(dofs.ravel(), own.ravel())[self.nodes] for own in shares)
+        now, then = (self.elimination.seam.sums(self.config.to_owners(dofs.ravel(), own.ravel()))[self.nodes] for own in shares)
         return np.where(then > 0, now / np.where(then > 0, then, 1.0), 1.0)
 
 
@@ -223,7 +223,7 @@ class MortarKinematics(PlacedOnTarget):
         of, rows, at = self.of, self.rows, self.rows.points
         own, area = at.nodes, at.duals.C.sum(axis=2)
         f, i = np.nonzero(area > 0)
-        total = of.config.add_at_owners(own[f, i], area[f, i, None])[of.nodes, 0]
+        total = of.elimination.total(own[f, i], area[f, i, None])[:, 0]
         scale = np.where(rows.covered, total, 1.0)
         found = []
         for parts in (terms_of(own, own, (at.duals.C @ of.basis.T)[..., None]), self._opposite()):

@@ -10,6 +10,8 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_groups
+from uem_dolfinx.conditions.seams import Seams
+from uem_dolfinx.contact.mortar.seam import Seam
 from uem_dolfinx.contact.mortar.tangent import SegmentPoints
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -46,6 +48,8 @@ class WeightedRows:
     """Equations of all contactors, one per contactor.
 
     Attributes:
+        sharing: number of contactors with the same row, of which each has an equal part of the force, see ``Seam`` ``(n,)``.
+        side: part of the plain row's direction that belongs to the contactor itself, not to others with the same row ``(n, gdim)``.
         equations: in the order of the contactors, all inactive. Their left sides are the derivatives of the gaps.
         length: divisors of these equations ``(n,)``.
         plain: the same equations with only the derivatives along the normals of the contactor's facets.
@@ -53,7 +57,7 @@ class WeightedRows:
         covered: contactors whose equation comes from segments ``(n,)``.
         facets: numbers of the contactor's facets near the target ``(m,)``.
         ratio: covered part of the contactor's share of its facets ``(n,)``.
-        area: integral of the contactor's dual function, the area of its multiplier as a pressure ``(n,)``.
+        area: integral of the contactor's dual function, the area of its multiplier as a pressure, over ``sharing`` ``(n,)``.
         stretch: current over reference area of the facets around the contactor ``(n,)``.
         share: contact force of this area over the multiplier ``(n,)``; 1 except at the middle nodes of quadratic facets.
         weights: terms by which contactors follow other nodes in the same mean, for friction; None without friction.
@@ -68,6 +72,8 @@ class WeightedRows:
         facing: keys, independent of the partition, of contactor and target facets that cover each other ``(p, 2)``.
     """
 
+    sharing: Array
+    side: Array
     equations: UnitingEquations
     length: Array
     plain: UnitingEquations
@@ -93,20 +99,40 @@ class Elimination:
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
+        seams: nodes of one displacement, or None.
+
+    Attributes:
+        seam: contactors of one displacement.
     """
 
-    def __init__(self, config: Configuration, nodes: Indices):
-        self.config, self.nodes = config, nodes
+    def __init__(self, config: Configuration, nodes: Indices, seams: Seams | None = None):
+        self.config, self.nodes, self.seam = config, nodes, Seam(config, nodes, seams)
         self._place = np.full(config.n_owned, -1, dtype=np.int64)
         self._place[nodes] = np.arange(len(nodes))
         self._own = config.to_global(nodes)
 
     def at_owners(self, parts: Sequence[Terms], scale: Array) -> Terms:
         """Send terms (node, followed node, coefficients) to the owners of their nodes and divide by ``scale (n,)`` (collective)."""
-        node, term, value = (np.concatenate(part) for part in zip(*parts))
+        node, term, value = self.seam.rows(*(np.concatenate(part) for part in zip(*parts)))
         node, term, value = Exchange.to(self.config.comm, self.config.owner_of(node)).send(node, term, value)
         row = self._place[node - self.config.first]
         return add_up_terms((row, term, value / scale[row, None]))
+
+    def total(self, nodes: Ints, values: Array) -> Array:
+        """Sums of values ``(m, k)`` at the facets' global nodes ``(m,)``, at the contactors ``(n, k)`` (collective)."""
+        return np.asarray(self.seam.sums(self.config.add_at_owners(nodes, values))[self.nodes])
+
+    def sides(self, nodes: Ints, values: Array) -> Array:
+        """Parts of groups' coefficients that belong to each contactor itself ``(n, k)``; zeros without groups (collective).
+
+        Args:
+            nodes: of facets ``(m, nn)``.
+            values: coefficients in the rows of the first by the second ``(m, nn, nn, k)``.
+        """
+        if not self.seam.any:
+            return np.zeros((len(self.nodes), values.shape[3]))
+        parts = np.einsum("mjak,mja->mak", values, self.seam.same(nodes))
+        return np.asarray(self.config.add_at_owners(nodes.ravel(), parts.reshape(-1, values.shape[3]))[self.nodes])
 
     def variation(self, at: SegmentPoints, scale: Array, plain: UnitingEquations) -> tuple[Terms, Array]:
         """Terms of the gaps' derivatives by the variation of normals and weights, over ``scale (n,)`` (collective).
@@ -122,7 +148,7 @@ class Elimination:
         variation = row, term, value = self.at_owners(terms, scale)
         own = np.einsum("ng,ng->n", self.of_themselves(plain, variation), plain.direction)
         kept = own[row] > 0.0
-        return (row[kept], term[kept], value[kept]), np.einsum("mjjg->mjg", on_facet)
+        return (row[kept], term[kept], value[kept]), np.einsum("mjag,mja->mjg", on_facet, self.seam.same(at.nodes))
 
     def of_themselves(self, plain: UnitingEquations, variation: Terms) -> Array:
         """Directions of rows including the terms at their own contactors ``(n, gdim)``."""

@@ -149,7 +149,8 @@ def turning(
     whole = rows.whole[which, None]
     mine = np.zeros((n, 1 + g))
     # directions and their changes are the same for any force across the target: one that makes the plain row's multiplier 1
-    mine[which] = np.column_stack([rows.share[which] / rows.area[which], tau / whole])
+    sharing = rows.sharing[which]
+    mine[which] = np.column_stack([rows.share[which] / (rows.area[which] * sharing), sharing[:, None] * tau / whole])
     there = config.from_owners(elimination.nodes, mine, dofs.ravel()).reshape(m, nc, 1 + g)
     # of every contactor: derivatives of its multiplier times its part of the gap's gradient, and of its share of the facets
     unit = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]

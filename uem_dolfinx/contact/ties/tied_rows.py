@@ -109,10 +109,10 @@ class TiedRows:
     """Equations of tied contactors.
 
     Attributes:
-        config: configuration of the displacement.
-        nodes: owned contactor nodes ``(n,)``.
+        elimination: assembly of rows.
         has: components in which contactors have an equation ``(n, gdim)``.
         own: divisors of these equations ``(n, gdim)``.
+        side: parts of these divisors from the facets on the contactor's own side of a seam ``(n, gdim)``; None for nodal equations.
         share: forces over multipliers ``(n, gdim)``; with mortar multipliers are mean tractions, otherwise nodal forces and share is 1.
         area: reference areas for these forces ``(n,)``; None for nodal forces.
         terms: contactors, global nodes and weights by which they follow ``(k,)``, ``(k,)``, ``(k, gdim)``.
@@ -121,10 +121,10 @@ class TiedRows:
         kept: whether normals are constant, as with small and fixed sliding.
     """
 
-    config: Configuration
-    nodes: Indices
+    elimination: Elimination
     has: Bools
     own: Array
+    side: Array | None
     share: Array
     area: Array | None
     terms: Terms
@@ -132,9 +132,15 @@ class TiedRows:
     held: Array | None
     kept: bool
 
-    @cached_property
-    def _elimination(self) -> Elimination:
-        return Elimination(self.config, self.nodes)
+    @property
+    def config(self) -> Configuration:
+        """Configuration of the displacement."""
+        return self.elimination.config
+
+    @property
+    def nodes(self) -> Indices:
+        """Owned contactor nodes ``(n,)``."""
+        return self.elimination.nodes
 
     @cached_property
     def _halo(self) -> Halo:
@@ -160,6 +166,8 @@ class TiedRows:
             apart = apart - (self.held if motion is None else motion.carry(self.held))
         else:
             apart = apart - sums_of_rows(row, weight * self._halo.take(config.x.__getitem__), n)
+        if self.side is not None:
+            apart = apart + self.elimination.seam.apart(self.nodes, self.side / self.own, config.x[: config.n_owned])
         at, c = np.nonzero(weight)
         # contactors, components, followed nodes and coefficient vectors
         parts = [(row[at], c, followed[at], weight[at, c, None] * np.eye(g)[c])]
@@ -167,9 +175,9 @@ class TiedRows:
             offset, slopes = self.spacers.at(self._y(), self.kept)
             w, to = self.spacers.weight, self.spacers.contactor
             pushed = np.einsum("pkg,pg->pkg", w, offset).reshape(-1, g)
-            apart = apart - config.add_at_owners(to.ravel(), pushed)[self.nodes] / self.own
+            apart = apart - self.elimination.total(to.ravel(), pushed) / self.own
             turned = np.einsum("pkg,pagh->pkagh", w, slopes).reshape(*to.shape, slopes.shape[1], g * g)
-            i, a, value = self._elimination.at_owners([terms_of(to, self.spacers.followed, turned)], np.ones(n))
+            i, a, value = self.elimination.at_owners([terms_of(to, self.spacers.followed, turned)], np.ones(n))
             value = value.reshape(-1, g, g) / self.own[i][:, :, None]
             parts.append((np.repeat(i, g), np.tile(np.arange(g), len(i)), np.repeat(a, g), value.reshape(-1, g)))
         rows, component, nodes, vectors = (np.concatenate(part) for part in zip(*parts))
@@ -194,6 +202,7 @@ class TiedRows:
             return []
         own = np.zeros((self.config.n_owned, multipliers.shape[1]))
         own[self.nodes] = multipliers / self.own
+        own = self.elimination.seam.sums(own)
         theirs = self.config.ask_owners(s.contactor.ravel(), own)
         force = np.einsum("pkg,pkg->pg", s.weight, theirs.reshape(s.weight.shape))
         return [(s.followed, s.curvature(self._y(), force))]
@@ -205,9 +214,8 @@ def to_surface(config: Configuration, nodes: Indices, target: Target, which: Boo
     points = config.x[nodes]
     held = points if target.motion is None else target.motion.back(points)
     none: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, g)))
-    return TiedRows(
-        config, nodes, np.repeat(which[:, None], g, axis=1), np.ones((n, g)), np.ones((n, g)), None, none, None, held, True
-    )
+    has = np.repeat(which[:, None], g, axis=1)
+    return TiedRows(Elimination(config, nodes), has, np.ones((n, g)), None, np.ones((n, g)), None, none, None, held, True)
 
 
 def to_facets(
@@ -222,7 +230,8 @@ def to_facets(
     one = np.ones((len(i), 1, g))
     spacers = Spacers(config.to_global(nodes[i])[:, None], one, p.nodes[i], tab.dN, height, p.x[i])
     has = np.repeat(which[:, None], g, axis=1)
-    return TiedRows(config, nodes, has, np.ones((n, g)), np.ones((n, g)), None, terms, _standing(config, spacers), None, kept)
+    made, one = Elimination(config, nodes), np.ones((n, g))
+    return TiedRows(made, has, one, None, one, None, terms, _standing(config, spacers), None, kept)
 
 
 def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: bool) -> TiedRows:
@@ -241,21 +250,19 @@ def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: boo
     tab, height = _foot(d.target, at.y[s.pair], s.eta, np.einsum("qa,qag->qg", at.phi, at.x[q]))
     k, (nc, nt) = len(e), (at.b.shape[1], tab.N.shape[1])
     N = add_up(s.pair, products(s.weight[:, None] * at.b, tab.N), k).reshape(k, nc, nt)
-    diagonal = np.zeros((*own.shape, g))
-    others, followed = np.zeros((len(own), nc, nc, g)), np.zeros((k, nc, nt, g))
+    by_node, followed = np.zeros((len(own), nc, nc, g)), np.zeros((k, nc, nt, g))
     psi = np.zeros((len(s.pair), nc, g))
     for c, duals in enumerate(_duals(d, rows, N)):
-        coefficients = duals.C @ d.basis.T
+        by_node[..., c] = duals.C @ d.basis.T
         followed[..., c] = duals.A[e] @ N
         psi[..., c] = s.weight[:, None] * np.einsum("qib,qb->qi", duals.A[q], at.b)
-        others[..., c] = np.where(np.eye(nc, dtype=bool), 0.0, coefficients)
-        diagonal[..., c] = np.einsum("mii->mi", coefficients)
-    own_parts = np.concatenate([diagonal, at.duals.C.sum(axis=2)[..., None]], axis=2).reshape(-1, g + 1)
-    whole, area = np.split(config.add_at_owners(own.ravel(), own_parts)[d.nodes], [g], axis=1)
+    same = d.elimination.seam.same(own)[..., None]
+    own_parts = np.concatenate([(by_node * same).sum(axis=2), at.duals.C.sum(axis=2)[..., None]], axis=2).reshape(-1, g + 1)
+    whole, area = np.split(d.elimination.total(own.ravel(), own_parts), [g], axis=1)
     has = (whole > 0.0) & which[:, None]
     scale = np.where(has, whole, 1.0)
     row, term, value = d.elimination.at_owners(
-        [terms_of(own, own, -others), terms_of(own[e], at.opposite, followed)], np.ones(len(d.nodes))
+        [terms_of(own, own, -by_node * ~same), terms_of(own[e], at.opposite, followed)], np.ones(len(d.nodes))
     )
     value = np.where(has[row], value / scale[row], 0.0)
     there = (np.abs(value) > NEGLIGIBLE).any(axis=1)
@@ -263,8 +270,9 @@ def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: boo
     spacers = Spacers(own[q], psi * tied[q], at.opposite[s.pair], tab.dN, height, at.y[s.pair])
     terms: Terms = (row[there], term[there], value[there])
     return TiedRows(
-        config, d.nodes, has, scale, area / scale, area[:, 0] / rows.stretch, terms, _standing(config, spacers), None, kept
-    )
+        d.elimination, has, scale, d.elimination.sides(own, by_node), area / scale, area[:, 0] / (rows.stretch * rows.sharing),
+        terms, _standing(config, spacers), None, kept,
+    )  # fmt: skip
 
 
 def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
@@ -282,12 +290,12 @@ def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
     if not d.prescribed:
         return [at.duals] * g
     covered, dofs, none = at.covered, d.surface.dofs[rows.facets], np.zeros(at.covered.D.shape, dtype=bool)
-    part, full = (config.to_owners(dofs.ravel(), values.ravel()) for values in (covered.D, covered.full))
-    first = d.precedence((part / np.where(full > 0, full, 1.0))[dofs], dofs)
+    part, ratio = d.covered_part(dofs, covered)
+    first = d.precedence(ratio[dofs], dofs)
     fixed = np.where(d.free_of_owned, 0.0, 1.0)
     theirs = config.ask_owners(at.opposite.ravel(), fixed).reshape(*at.opposite.shape, g)
     follows = np.abs(at.duals.A[at.facet] @ N) @ theirs
-    follows = config.add_at_owners(at.nodes[at.facet].ravel(), follows.reshape(-1, g))[d.nodes]
+    follows = d.elimination.total(at.nodes[at.facet].ravel(), follows.reshape(-1, g))
     both = ~d.free & (follows > MOSTLY_PRESCRIBED * part[d.nodes, None])
     held = config.from_owners(d.nodes, both.astype(float), dofs.ravel()).reshape(*dofs.shape, g) > 0.5
     held &= ~held.all(axis=1, keepdims=True)

@@ -3,37 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 
+from uem_dolfinx.arrays import Ints
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
 
-def warn_of_seams(equations: Sequence[Any], pairs: Sequence[Interface]) -> None:
-    """Warn of equations between contactors of one mortar contact (collective).
+def warn_of_seams(equations: Sequence[tuple[Ints, Ints]], pairs: Sequence[Interface]) -> None:
+    """Warn of equations between contactors of one mortar contact that do not give them one displacement (collective).
 
-    Each of these contactors has the row of the segments on its own side of the seam, although both have one displacement. The force of
-    both is right up to the angle between the normals of the two sides; one contactor has all of it.
+    Each of these contactors has the row of the segments on its own side, although they move together. The force of both is right up to
+    the angle between the normals of the two sides; one contactor has all of it.
+
+    Args:
+        equations: row and global node of each term of this rank's equations, list by list.
+        pairs: of all contacts.
     """
-    pairs = [pair for pair in pairs if isinstance(pair.discretisation, Contactors)]
-    if not pairs:
-        return
-    config = pairs[0].config
-    found = [one.rows(config, f"equations[{i}]") for i, one in enumerate(equations)]
     for pair in pairs:
+        if not isinstance(pair.discretisation, Contactors):
+            continue
+        config = pair.config
         is_contactor = np.zeros((config.n_owned, 1))
         is_contactor[pair.nodes] = 1.0
         places = []
-        for rows in found:
-            there = config.ask_owners(rows.node, is_contactor)[:, 0] > 0
-            united = np.bincount(rows.row[there], minlength=len(rows)) > 1
-            places.append(config.ask_owners(rows.node[there & united[rows.row]], config.X[: config.n_owned]))
+        for row, node in equations:
+            there = config.ask_owners(node, is_contactor)[:, 0] > 0
+            united = np.bincount(row[there]) > 1
+            places.append(config.ask_owners(node[there][united[row[there]]], config.X[: config.n_owned]))
         at = np.concatenate(places)
         if not reduced(config.comm, len(at)):
             continue
@@ -41,8 +43,8 @@ def warn_of_seams(equations: Sequence[Any], pairs: Sequence[Interface]) -> None:
         high = [reduced(config.comm, float(x.max(initial=-np.inf)), op=MPI.MAX) for x in at.T]
         ends = (", ".join(f"{round(x / config.size, 9) * config.size + 0.0:.6g}" for x in end) for end in (low, high))
         logger.warning(
-            "%s: equations unite contactors between (%s) and (%s) with each other, where coupling='mortar' gives each the row of its own "
-            "side: if there is contact, the pressure of one is too large by up to the force of the other, and degree 2 may not converge; "
-            "take coupling='node_to_surface', or put the seam where there is no contact",
+            "%s: equations tie contactors between (%s) and (%s) to each other, but do not give them one displacement, and "
+            "coupling='mortar' gives each the row of its own side: if there is contact, the pressure of one is too large by up to the "
+            "force of the other, and degree 2 may not converge; take coupling='node_to_surface', or put the seam where there is no contact",
             pair.name, *ends,
         )  # fmt: skip

@@ -115,15 +115,14 @@ class Watch:
 
     Args:
         contacts: of the problem, which have begun.
-        equations: equations of users.
     """
 
-    def __init__(self, contacts: Sequence[WatchedContact], equations: Sequence[Any] = ()):
+    def __init__(self, contacts: Sequence[WatchedContact]):
         self._contacts = contacts
-        if contacts and equations:
+        if contacts and contacts[0].config.seams is not None:
             from uem_dolfinx.contact.warnings.seams import warn_of_seams
 
-            warn_of_seams(equations, [contact.pair for contact in contacts])
+            warn_of_seams(contacts[0].config.seams.others, [contact.pair for contact in contacts])
         self._corners: dict[int, tuple[TargetCorners, list[WatchedContact]]] = {}
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
         self._off_at_start: dict[int, Bools] = {}
