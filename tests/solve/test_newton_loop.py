@@ -91,9 +91,9 @@ class OneUnknown:
         return solve_united(self, self, rtol=1e-8, max_iterations=max_iterations, line_search=line_search, verbose=False)
 
 
-@pytest.mark.parametrize(("left", "length"), [(0.3, 1.0), (0.85, 1.0), (0.95, 1.0 / 64)])
+@pytest.mark.parametrize(("left", "length"), [(0.3, 1.0), (0.85, 1.0), (0.95, 1.0 / 64), (-0.45, 1.0), (-0.55, 0.5)])
 def test_what_the_line_search_accepts(left, length):
-    """A step that leaves 0.85 of the residual is taken whole, one that leaves 0.95 is shortened until nothing is left to shorten."""
+    """A step that leaves 0.85 of the residual, or 0.45 past its zero, is taken whole; others are shortened."""
     system = OneUnknown(left)
     assert system.loop()[1].step_length == length
 
