@@ -16,6 +16,7 @@ from helpers import at, blocks, box, clamp, linear, run, scene, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.conditions.equation import GivenRows
 from uem_dolfinx.conditions.seams import Seams
 from uem_dolfinx.geometry.configuration import configuration_of
 
@@ -42,22 +43,25 @@ def rigid_wave(g, along):
     return uem.RigidSurface(lambda x: HEIGHT + wave([x[i] for i in along]) - x[g - 1], slopes)
 
 
+def pulled(x):
+    """A periodic displacement along the first direction, none at multiples of a half, beside which facets get other sizes."""
+    return np.eye(x.shape[1])[0] * np.sin(2 * np.pi * x[:, :1]) ** 2
+
+
 def everywhere(values):
     return np.concatenate(COMM.allgather(values))
 
 
-def slab(
-    start, n, coupling="mortar", target="rigid", degree=1, cell="quadrilateral", steps=2, drag=0.0, measure="reference", **how
-):
+def slab(start, n, coupling="mortar", target="rigid", degree=1, cell="quadrilateral", steps=2, drag=0.0, graded=0.0, **how):
     """A periodic slab between ``start`` and a period further, under a wave that moves down and by ``drag`` sideways.
 
     The wave is a rigid surface, or a mesh that moves as prescribed and overhangs the slab at all sides.
 
     Returns:
-        Places of contactors within one period, and there pressure, friction, slip and status; then sums; then iterations.
+        Places of contactors within one period, and there pressures, friction, slip and status; then sums; then iterations.
     """
     g, start = len(start) + 1, np.array(start)
-    bodies = [box(cell, [*start, 0.0], [*(start + PERIOD), HEIGHT], n)]
+    bodies = [box(cell, [*start, 0.0], [*(start + PERIOD), HEIGHT], n).mapped(lambda x: x + graded * pulled(x))]
     if target == "mesh":
         bodies.append(box(cell, [*(start - 0.5), HEIGHT], [*(start + PERIOD + 0.5), 1.2 * HEIGHT], [18] * (g - 1) + [1]))
     s = scene(COMM, cell, bodies)
@@ -78,7 +82,7 @@ def slab(
         def load(f):
             surface.move((drag * f, *[0.0] * (g - 2), -DEPTH * f))
 
-    contact = uem.Contact(top, surface, coupling=coupling, measure=measure, **how)
+    contact = uem.Contact(top, surface, coupling=coupling, **how)
     problem = uem.UnitedProblem(
         linear(u, 1000.0), u, bcs=bcs, contacts=[contact], equations=[uem.periodic(*pair) for pair in sides], rtol=1e-11,
         **({} if load is None else {"load": load}),
@@ -90,7 +94,15 @@ def slab(
         return np.linalg.norm(f.x.array.reshape(-1, g)[nodes], axis=1)
 
     X = np.round(np.mod(V.tabulate_dof_coordinates()[nodes, : g - 1], PERIOD), 6) % PERIOD
-    here = [X, contact.pressures, nodal(contact.traction), nodal(contact.slip), contact.status.x.array[nodes]]
+    density = contact.pressure_to_integrate()
+    here = [
+        X,
+        contact.pressures,
+        density.x.array[nodes],
+        nodal(contact.traction),
+        nodal(contact.slip),
+        contact.status.x.array[nodes],
+    ]
     table = everywhere(np.column_stack(here))
     table = table[np.lexsort(table.T[: g - 1])]
     twice = np.flatnonzero((np.diff(table[:, : g - 1], axis=0) == 0).all(axis=1))
@@ -98,7 +110,7 @@ def slab(
     if coupling == "mortar":
         assert table[twice, g - 1 :] == pytest.approx(table[twice + 1, g - 1 :], abs=1e-11)
     whole = contact.resultant()
-    integral = uem.integrate(contact.pressure_to_integrate() * uem.ds(top))
+    integral = uem.integrate(density * uem.ds(top))
     assert integral == pytest.approx(whole.normal, rel=1e-12)
     sums = [*whole.force, whole.normal, contact.max_pressure(), contact.dissipation]
     return np.delete(table, twice, axis=0), sums, iterations
@@ -136,6 +148,11 @@ FLAT = [16, 5]
         {"target": "mesh", "tied": True, "drag": 0.02, "sliding": "small"},
         {"coupling": "node_to_surface", "friction": 0.3, "drag": 0.004},
         {"coupling": "node_to_surface", "degree": 2},
+        {"graded": 0.05, "friction": 0.3, "drag": 0.004},
+        {"graded": 0.05, "degree": 2, "target": "mesh"},
+        {"graded": 0.05, "tied": True, "target": "mesh"},
+        {"graded": 0.05, "coupling": "node_to_surface", "measure": "current"},
+        {"graded": 0.05, "coupling": "node_to_surface", "degree": 2},
     ],
     ids=str,
 )
@@ -291,10 +308,10 @@ def united(rows):
     config = configuration_of(compat.function_space(s.mesh, 1, (2,)))
     # each rank has some
     mine = rows[COMM.rank :: COMM.size]
-    row = np.repeat(np.arange(len(mine)), [len(one) for one in mine]).astype(np.int64)
+    row, value = np.repeat(np.arange(len(mine)), [len(one) for one in mine]).astype(np.int64), np.zeros(len(mine), np.int64)
     node = np.array([node for one in mine for node, _ in one], dtype=np.int64)
     c = np.array([c for one in mine for _, c in one], dtype=float).reshape(-1, 2)
-    seams = Seams(config, [(row, node, c)])
+    seams = Seams(config, [GivenRows(value, row, node, c)])
     others = COMM.allreduce(sum(len(np.unique(row)) for row, _ in seams.others))
     return {frozenset(seams.node[seams.group == k].tolist()) for k in np.unique(seams.group)}, others
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE
 from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.conditions.equation import LinearEquations
+from uem_dolfinx.conditions.equation import GivenRows, LinearEquations
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
 
@@ -19,19 +19,20 @@ class Seams:
 
     Args:
         space: the nodes.
-        equations: of this rank: row, global node and coefficients of each term of several lists.
+        given: equations of this rank, several lists.
 
     Attributes:
+        given: the same.
         node: global nodes ``(k,)``, ascending.
         group: number of the group of each ``(k,)``.
         others: row and global node of each term of this rank's equations that are not of such a group, list by list.
     """
 
-    def __init__(self, space: Nodes, equations: Sequence[tuple[Ints, Ints, Array]]):
+    def __init__(self, space: Nodes, given: Sequence[GivenRows]):
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
-        equations = [_of_something(*one) for one in equations]
+        self.given, equations = given, [_of_something(one.row, one.node, one.coefficients) for one in given]
         found = [_differences(*one) for one in equations]
         every = np.unique(np.concatenate(space.comm.allgather(np.concatenate([np.zeros((0, 3), np.int64), *found]))), axis=0)
         pairs, count = np.unique(every[:, :2], axis=0, return_counts=True)
@@ -51,11 +52,10 @@ class Seams:
         return row[~alike[row]], node[~alike[row]]
 
 
-def note_seams(config: Configuration, equations: Sequence[LinearEquations], couplings: Sequence[Any]) -> None:
-    """Set the configuration's ``seams`` if there are equations of users and contacts by mortar, before these are made (collective)."""
-    if equations and "mortar" in couplings:
-        found = [one.rows(config, f"equations[{i}]") for i, one in enumerate(equations)]
-        config.seams = Seams(config, [(one.row, one.node, one.coefficients) for one in found])
+def note_seams(config: Configuration, equations: Sequence[LinearEquations], contacts: Sequence[Any]) -> None:
+    """Set the configuration's ``seams`` if there are equations of users and contacts, before these are made (collective)."""
+    if equations and contacts:
+        config.seams = Seams(config, [one.rows(config, f"equations[{i}]") for i, one in enumerate(equations)])
 
 
 def groups_of(nodes: Ints, known: Ints, group: Ints) -> Ints:

@@ -81,7 +81,9 @@ class UnitedRows:
     def _make(self, first: Ints, free: Bools, contactors: Bools) -> None:
         """Choose the component that each equation eliminates (collective)."""
         config = self._config
-        parts = [one.rows(config, f"equations[{i}]") for i, one in enumerate(self._declared)]
+        parts = (
+            config.seams.given if config.seams else [one.rows(config, f"equations[{i}]") for i, one in enumerate(self._declared)]
+        )
         item = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
         rows = GivenRows.join([replace(p, value=p.value + f) for p, f in zip(parts, first)])
         size = sizes(config, rows, free)

@@ -16,6 +16,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools, Indices, cross_products
 from uem_dolfinx.contact.laws.conductance import one_of_fields
+from uem_dolfinx.contact.mortar.seam import Seam
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -153,7 +154,13 @@ class ContactResults:
     def measured_areas(self) -> Array:
         """Areas for pressures and tractions at contactors ``(n_contactors,)``, zero where there is no area (collective)."""
         current = self.measure == "current"
-        return self.pair.areas(self.areas_facing(self.nodes, self.pair.projection.normal, current), current, self._areas)
+        facing = self.areas_facing(self.nodes, self.pair.projection.normal, current)
+        return self._seam.evenly(self.nodes, self.pair.areas(facing, current, self._areas))
+
+    @cached_property
+    def _seam(self) -> Seam:
+        """Contactors that equations of users give one displacement (first time: collective)."""
+        return Seam(self.config, self.nodes, self.config.seams)
 
     def areas_facing(self, nodes: Indices, normal: Array | None, current: bool) -> Array:
         """Integrals of the shape functions at contactors ``(n,)``, at sharp edges over facets that face the target (collective).
@@ -187,8 +194,9 @@ class ContactResults:
     def pressures(self) -> Array:
         """Contact pressure at this rank's contactors ``(n_contactors,)`` (collective).
 
-        The normal force over the node's tributary area. With ``coupling="mortar"`` only the covered part of this area counts,
-        otherwise at sharp edges only facets that face the target. ``measure`` selects the reference or the current surface.
+        The normal force over the node's tributary area; at a seam both are means of its sides. With ``coupling="mortar"`` only the
+        covered part of this area counts, otherwise at sharp edges only facets that face the target. ``measure`` selects the reference
+        or the current surface.
         Pressure is negative where tied surfaces are in tension.
         """
         areas = self.measured_areas()
@@ -215,7 +223,7 @@ class ContactResults:
         f = self._field("pressure_to_integrate", 0.0)
         if self.contactor.dim > 0:
             normal = None if self.coupling == "mortar" else self.pair.projection.normal
-            areas = self.surface.of_functions(self.nodes, normal, lambda shape: basis_of(shape).T)
+            areas = self._seam.evenly(self.nodes, self.surface.of_functions(self.nodes, normal, lambda shape: basis_of(shape).T))
             f.x.array[: self.config.n_owned] = density(self.config, self.contactor, self.nodes, self.pair.pressing()[0], areas)
             f.x.scatter_forward()
         return f

@@ -34,6 +34,8 @@ class Configuration(Nodes):
     moves = True
     #: Name of the solution in results and checkpoints.
     name = "displacement"
+    #: Nodes that equations of users give one displacement, see ``conditions.seams.Seams``; None without equations or contacts.
+    seams: Any = None
 
     def __init__(self, u: fem.Function):
         #: The Function with all unknowns, and the displacement in UFL; identical without other fields.
@@ -59,8 +61,6 @@ class Configuration(Nodes):
         if degree > 2:
             raise SpaceError(f"contact surfaces of degree {degree} are not supported: use degree 1 or 2")
         super().__init__(V)
-        #: Nodes that equations of users give one displacement, see ``conditions.seams.Seams``; None if no contact needs to know them.
-        self.seams: Any = None
         #: Shared facets of surfaces while they are in use, by ``id`` of their tags; see ``facets.facets_of``.
         self.surfaces: WeakValueDictionary[int, Any] = WeakValueDictionary()
         #: Whether the coordinates are radius and height, and nodes represent circles.

@@ -200,7 +200,7 @@ class UnitedProblem(given.Sealed):
         self.solver = solver_of(self.config, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
-        note_seams(self.config, equations, [contact.coupling for contact in self.contacts])
+        note_seams(self.config, equations, self.contacts)
         for contact in self.contacts:
             contact.attach(self.config, free, **clock)
         refuse_shared_pressures(self.config, self.contacts)

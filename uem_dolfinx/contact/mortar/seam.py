@@ -27,7 +27,7 @@ class Seam:
         own = np.isin(node, space.to_global(nodes))
         kept = reduced(space.comm, own) > 0 if seams is not None else own
         kept[kept] = (np.bincount(group[kept]) > 1)[group[kept]]
-        self._comm, self._node = space.comm, node[kept]
+        self._comm, self._n_owned, self._node = space.comm, space.n_owned, node[kept]
         _, self._group = np.unique(group[kept], return_inverse=True)
         #: Whether there are any.
         self.any = bool(kept.any())
@@ -53,6 +53,12 @@ class Seam:
         sums, some, out = reduced(self._comm, sums), self._local < len(values), values.copy()
         out[self._local[some]] = sums[self._of_local[some]]
         return out
+
+    def evenly(self, nodes: Indices, values: Array) -> Array:
+        """Values of owned contactors ``(n,)``, with the mean of each group at all of it (collective)."""
+        nodal = np.zeros(self._n_owned)
+        nodal[nodes] = values
+        return np.asarray(self.sums(nodal)[nodes] / self.sharing)
 
     def apart(self, nodes: Indices, own: Array, values: Array) -> Array:
         """Terms ``own . v`` of all of a group, less those of its sum times the contactor's own values: 0 for equal ones (collective).
