@@ -83,7 +83,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 if item not in first:
                     item.add_marker("slow")
             others = [item for item in cases if item not in first]
-            runs |= {*first, *_spread(others, len(others) if most is None else max(most - len(first), 0))}
+            every_one = most is None or cases[0].get_closest_marker("every_case") is not None
+            runs |= {*first, *_spread(others, len(others) if every_one else max(most - len(first), 0))}
     config.hook.pytest_deselected(items=[item for item in items if item not in runs])
     items[:] = [item for item in items if item in runs]
 

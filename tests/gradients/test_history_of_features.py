@@ -18,6 +18,8 @@ from helpers import blocks, highest, refused
 
 import uem_dolfinx as uem
 
+pytestmark = pytest.mark.every_case
+
 COMM = MPI.COMM_WORLD
 STEPS = 3
 

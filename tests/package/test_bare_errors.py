@@ -11,6 +11,8 @@ from ramp_scenes import COMM, five_steps, nothing
 
 import uem_dolfinx as uem
 
+pytestmark = pytest.mark.every_case
+
 
 def rough(friction):
     b = blocks(COMM, "triangle")

@@ -16,6 +16,8 @@ from helpers import blocks, linear, raised
 import uem_dolfinx as uem
 from uem_dolfinx.log import STAGES
 
+pytestmark = pytest.mark.every_case
+
 COMM = MPI.COMM_WORLD
 PACKAGE = Path(uem.__file__).parent
 

@@ -13,6 +13,8 @@ from ramp_scenes import COMM, RAMPS
 
 import uem_dolfinx as uem
 
+pytestmark = pytest.mark.every_case
+
 #: Where the block's top goes, in steps.
 WAY = [(0.0, -0.03), (0.07, -0.05), (0.16, -0.05), (0.21, -0.04)]
 #: Where no attempt of two iterations comes to.

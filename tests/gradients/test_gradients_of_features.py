@@ -18,6 +18,8 @@ from helpers import blocks, refused
 
 import uem_dolfinx as uem
 
+pytestmark = pytest.mark.every_case
+
 COMM = MPI.COMM_WORLD
 ALL = ("E", "top", "X", "offset")
 
