@@ -159,7 +159,7 @@ def test_rigid_motion_is_a_united_motion(cell):
     problem = uem.UnitedProblem(linear(b.u, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0))), b.u, contacts=[contact])
     assert contact.n_active == 4 ** (b.gdim - 1)
     free = np.ones((problem.config.n_owned, b.gdim), bool)
-    r = Restriction(problem.config, contact.pair.equations().test, free, np.zeros(free.shape))
+    r = Restriction(problem.config, contact.pair.equations().Q, free, np.zeros(free.shape))
     K = problem.bodies.update_tangent()
     solver = UnitedSolver(problem.config, "modes_", {"ksp_type": "cg", "pc_type": "gamg"})
     solver.set_operator(r, K, None)

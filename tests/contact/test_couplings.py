@@ -40,11 +40,11 @@ def test_equations_against_a_loop(cell):
     _, problem, contact = pressed(cell)
     pair, config = contact.pair, problem.config
     rows = pair.equations()
-    assert rows.trial is rows.test and (rows.kind == NORMAL).all()
+    assert rows.P is rows.Q and (rows.kind == NORMAL).all()
     assert np.array_equal(np.sort(rows.contactor), np.arange(len(pair.nodes)))
     du = np.cos(5 * config.X + 1)
     of_all = np.concatenate(COMM.allgather(du[: config.n_owned]))
-    eq, p = rows.trial, pair.projection
+    eq, p = rows.P, pair.projection
     left = np.einsum("mg,mg->m", eq.direction, du[eq.node])
     np.subtract.at(left, eq.row, np.einsum("kg,kg->k", eq.coefficients, of_all[eq.followed]))
     for k, i in enumerate(rows.contactor):
@@ -66,7 +66,7 @@ def test_forces_come_in_pairs(cell, degree):
     assert np.abs(total).max() <= 1e-13 * COMM.allreduce(np.abs(forces).sum())
     du = np.cos(5 * config.X + 1)
     of_all = np.concatenate(COMM.allgather(du[: config.n_owned]))
-    eq = rows.test
+    eq = rows.Q
     work = multipliers * np.einsum("mg,mg->m", eq.direction, du[eq.node])
     np.subtract.at(work, eq.row, multipliers[eq.row] * np.einsum("kg,kg->k", eq.coefficients, of_all[eq.followed]))
     assert COMM.allreduce(np.einsum("kg,kg->", forces, of_all[nodes])) == pytest.approx(COMM.allreduce(work.sum()), rel=1e-11)

@@ -89,12 +89,12 @@ def test_rows_do_not_depend_on_who_is_active():
     pair, system = b.contact.pair, b.problem.system
     covered, start = pair.kinematics.rows.covered, pair.trial
     pair.reserved = covered
-    first = pair.equations().trial
+    first = pair.equations().P
     for k in range(8):
         # alike on any number of ranks
         some = np.sin(997 * (k + 1) * pair.config.X[pair.nodes].sum(axis=1)) > (k - 4) / 4
         pair.trial = replace(start, active=covered & some)
-        eq = pair.equations().trial
+        eq = pair.equations().P
         for name in ("direction", "gap", "row", "followed", "coefficients"):
             assert np.array_equal(getattr(eq, name), getattr(first, name))
         rows = system.restriction()

@@ -73,10 +73,10 @@ def test_rows_do_not_depend_on_who_is_active(cell):
     problem.system.place()
     pair, rng = b.contact.pair, np.random.default_rng(5)
     every = np.arange(len(pair.nodes))
-    first = pair.kinematics.gap_rows.select(every, np.ones(len(every), bool)).trial
+    first = pair.kinematics.gap_rows.select(every, np.ones(len(every), bool)).P
     for _ in range(3):
         pair.trial = replace(pair.trial, active=rng.random(len(every)) < 0.5)
-        made = pair.kinematics.gap_rows.select(every, pair.trial.active).trial
+        made = pair.kinematics.gap_rows.select(every, pair.trial.active).P
         assert (made.active == pair.trial.active).all()
         for name in ("node", "direction", "gap", "row", "followed", "coefficients"):
             assert np.array_equal(getattr(made, name), getattr(first, name))

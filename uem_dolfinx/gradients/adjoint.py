@@ -274,7 +274,7 @@ class Linearised:
                 f"contact '{m.contact.name}': equations follow each other in rings, or conflict, so that its {m.parameter} has no "
                 "derivative here; let nodes be contactors of one contact, with free normals"
             )
-        own, rows = slice(first, first + len(self.equations[k])), self.equations[k].trial
+        own, rows = slice(first, first + len(self.equations[k])), self.equations[k].P
         if m.parameter == "offset":
             gaps[own], forces = thickened(pair, self.multipliers[own])
             return gaps, forces

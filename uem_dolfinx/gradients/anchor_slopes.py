@@ -17,7 +17,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.contact.seam.placement import Constraints
+from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.projection import FacetProjection, foot_slopes
@@ -107,7 +107,7 @@ class AnchorSlopes:
         """Number of coordinates of an anchor."""
         return self._anchor.shape[1]
 
-    def by_anchors(self, by_gaps: Array, equations: Constraints, a: Array) -> Array:
+    def by_anchors(self, by_gaps: Array, equations: ContactRows, a: Array) -> Array:
         """Derivative by the anchors ``(n, k)`` (collective).
 
         Args:
@@ -117,7 +117,7 @@ class AnchorSlopes:
         """
         pair, kinematics, n = self._pair, self._pair.kinematics, len(self._pair.nodes)
         pulled = np.zeros((n, self._config.gdim))
-        np.add.at(pulled, equations.contactor, -by_gaps[:, None] * equations.trial.direction)
+        np.add.at(pulled, equations.contactor, -by_gaps[:, None] * equations.P.direction)
         found = np.where(self.stuck[:, None], np.einsum("nkg,ng->nk", self._anchor, pulled), 0.0)
         p = kinematics.projection
         if isinstance(p, FacetProjection):

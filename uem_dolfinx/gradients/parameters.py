@@ -109,7 +109,7 @@ def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array) -> tupl
         pair.kinematics = pair.discretisation.with_variation(pair.kinematics)
     own, config = pair.equations(), pair.config
     longer = (pair.kinematics.gap_rows.scale / length)[own.contactor]
-    return own.trial.gap * longer, forces_of(config, own.test, multipliers * longer)
+    return own.P.gap * longer, forces_of(config, own.Q, multipliers * longer)
 
 
 def rubbed(pair: Interface) -> Array:

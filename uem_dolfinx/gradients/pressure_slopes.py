@@ -19,7 +19,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.seam.placement import NORMAL, Constraints
+from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
 
@@ -52,7 +52,7 @@ class PressureSlopes:
             edges of contactors, without mortar.
     """
 
-    def __init__(self, contact: Contact, equations: Constraints):
+    def __init__(self, contact: Contact, equations: ContactRows):
         self.contact, self._pair, self._equations = contact, contact.pair, equations
         self._config, self._current = contact.config, contact.measure == "current"
         held = self._pair.trial.active & self._pair.trial.in_corner

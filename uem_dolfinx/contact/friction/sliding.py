@@ -24,7 +24,7 @@ from uem_dolfinx.contact.friction.slip_front import Front
 from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING, Violations
 from uem_dolfinx.contact.seam.corners import friction_in
-from uem_dolfinx.contact.seam.placement import Constraints, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -302,7 +302,7 @@ class Sliding:
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
-    def equations(self, own: Constraints, state: PairState, kinematics: Kinematics) -> Constraints:
+    def equations(self, own: ContactRows, state: PairState, kinematics: Kinematics) -> ContactRows:
         """Equations with tangential ones for sticking contactors, and rotated test rows for slipping contactors (collective)."""
         return with_friction(
             own,
@@ -316,22 +316,21 @@ class Sliding:
             keeps_ties=self.keeps_feet or self.discretisation.at_feet,
         )
 
-    def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
+    def set_redundant(self, equations: ContactRows, redundant: Bools) -> None:
         """Set which tangential equations were dropped; ``redundant (m,)`` refers to all equations."""
         which = equations.tangent >= 0
         self.left_out = np.zeros_like(self.left_out)
         self.left_out[equations.contactor[which], equations.tangent[which]] = redundant[which]
 
     def forces(
-        self, equations: Constraints, multipliers: Array, state: PairState, kinematics: Kinematics, du: Array | None
+        self, equations: ContactRows, multipliers: Array, state: PairState, kinematics: Kinematics, du: Array | None
     ) -> Traction:
         """Normal and tangential forces from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
-        held = equations.tangent >= 0
-        across = kinematics.forces(state, equations.across(), multipliers[~held])
-        share, i = kinematics.force_per_multiplier, np.flatnonzero(held)
+        across = kinematics.forces(state, equations, multipliers)
+        share, i = kinematics.force_per_multiplier, np.flatnonzero(equations.tangent >= 0)
         limit = self._limit(state, across.lam) / share
         tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
-        np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.test.direction[i])
+        np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.rows.direction[i])
         if du is not None and self._follows_slip:
             sideways, part, stiffness = self.turning(state, kinematics)
             i = np.flatnonzero(self.slipping(state))

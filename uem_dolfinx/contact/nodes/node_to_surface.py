@@ -18,7 +18,7 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
 from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, GapRows, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, GapRows, Traction
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
@@ -245,16 +245,15 @@ class NodalKinematics(PlacedOnTarget):
         p, none = self.projection, np.zeros(len(self.points), bool)
         return UnitingEquations.along(self.of.nodes, p.normal, p.nodes, weights, self.gap, none)
 
-    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+    def forces(self, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
         """Normal contact forces, summed over the facets of a corner (collective)."""
         lam = np.zeros(len(self.points))
-        normal = equations.kind == NORMAL
-        lam[equations.contactor[normal]] = multipliers[normal]
+        lam[rows.contactor[rows.normal]] = multipliers[rows.normal]
         (lam, nodal), c = self._nodal(state, lam), self.corners
         force = nodal[:, None] * self.projection.normal
         for r in range(1, self.of.config.gdim):
-            j = np.flatnonzero(equations.kind == r)
-            force[equations.contactor[j]] += multipliers[j, None] * equations.test.direction[j]
+            j = np.flatnonzero(rows.kind == r)
+            force[rows.contactor[j]] += multipliers[j, None] * rows.rows.direction[j]
         lam = lam * self.cone
         if c is not None:
             lam[c.which] = np.einsum("kg,kg->k", force[c.which], c.summing)

@@ -18,7 +18,7 @@ from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.pair.told import Told
 from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.ends import slide_off
-from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -278,7 +278,7 @@ class Interface(Told):
     def approach(self) -> UnitingEquations:
         """Normal equations of inactive contactors in front of the target."""
         rows = self.kinematics.gap_rows.select(self._ahead, np.ones(len(self.nodes), bool))
-        return rows.test.select(rows.kind == NORMAL)
+        return rows.rows.select(rows.normal)
 
     def activate_closing(self, closing: Bools) -> bool:
         """Activate the contactors of ``approach`` that are ``closing`` and touch (collective): whether there are any."""
@@ -297,7 +297,7 @@ class Interface(Told):
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
-    def equations(self) -> Constraints:
+    def equations(self) -> ContactRows:
         """Equations of the contactors that are or may become active, then of tied contactors (collective).
 
         Contactors near the target have rows; this set is renewed when an active contactor has no row. At first touch, it is the active set.
@@ -310,28 +310,24 @@ class Interface(Told):
             own = self.friction.equations(own, self.trial, self.kinematics)
         return own if self.tie is None else self.tie.join(own)
 
-    def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
+    def set_redundant(self, equations: ContactRows, redundant: Bools) -> None:
         """Set which of the equations ``(m,)`` are redundant and were dropped."""
         if self.tie is not None:
             self.tie.set_redundant(equations, redundant)
-        equations, redundant = equations.contact, redundant[: len(equations.contact)]
-        normal = (equations.kind == NORMAL) & (equations.tangent < 0)
         self.redundant = np.zeros(len(self.nodes), dtype=bool)
-        self.redundant[equations.contactor[normal]] = redundant[normal]
+        self.redundant[equations.contactor[equations.normal]] = redundant[equations.normal]
         if self.friction is not None:
             self.friction.set_redundant(equations, redundant)
 
-    def forces(self, equations: Constraints, multipliers: Array, du: Array | None = None) -> Traction:
+    def forces(self, equations: ContactRows, multipliers: Array, du: Array | None = None) -> Traction:
         """Contact forces from the multipliers of the equations ``(m,)`` (collective).
 
         ``du (n_owned, gdim)`` is the increment used for the prediction; None for the current configuration.
         """
-        contact = equations.contact
-        of, trial, kinematics = multipliers[: len(contact)], self.trial, self.kinematics
         if self.friction is None:
-            found = kinematics.forces(trial, contact, of)
+            found = self.kinematics.forces(self.trial, equations, multipliers)
         else:
-            found = self.friction.forces(contact, of, trial, kinematics, du)
+            found = self.friction.forces(equations, multipliers, self.trial, self.kinematics, du)
         return found if self.tie is None else self.tie.with_forces(found, equations, multipliers)
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import Constraints, Kinematics, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, Kinematics, Traction
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
@@ -175,11 +175,11 @@ class PlacedOnTarget:
         """Open ends, which hold no contactors here."""
         return Ends(self.projection, self.of.thickness)
 
-    def forces(self: Kinematics, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
+    def forces(self: Kinematics, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
         """Forces of the rows at both bodies, where contactors follow each other too (collective)."""
-        rows, mu = self.gap_rows, np.zeros(len(self.points))
-        mu[equations.contactor] = multipliers
-        force = np.asarray(rows.config.add_at_owners(*rows.forces(mu))[rows.equations.node])
+        of, mu = self.gap_rows, np.zeros(len(self.points))
+        mu[rows.contactor[rows.normal]] = multipliers[rows.normal]
+        force = np.asarray(of.config.add_at_owners(*of.forces(mu))[of.equations.node])
         lam = mu * self.pressure_map(False).force
         return Traction(lam, np.einsum("ng,ng->n", force, self.projection.normal), force)
 

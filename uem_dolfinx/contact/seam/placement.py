@@ -7,6 +7,7 @@ and forces only, not on rows.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -52,53 +53,105 @@ class Traction(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Constraints:
-    """Constraint equations of one interface, each with its contactor and kind. Equal lists are the same object.
+class ContactRows:
+    """Constraint equations of one interface or of several, each with its contactor. P and Q eliminate the same nodes.
 
     Attributes:
-        trial: rows of P for the motion of contactors, ``du = P dq + c``.
-        test: rows of Q for the distribution of contact forces, ``Q'r = 0``. Both lists have the same order and eliminate the same
-            nodes.
-        frictionless: test rows without the friction of slipping contactors.
-        resisting: trial rows of all relative motions that contact and friction resist.
-        stopping: trial rows that restrain rigid-body motions.
-        contactor: index of each equation's contactor in the interface ``(m,)``.
-        kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
-        tangent: number of the tangential direction for equations of sticking friction, -1 for all others ``(m,)``.
+        rows: Q without friction: gradients of the gaps, then directions along the target; active ones are eliminated ``(m,)``.
+        contactor: index of each row's contactor in its interface ``(m,)``; -1 for equations of users.
+        kind: ``NORMAL``, or the number of a corner's further axis; ``-1 - c`` for component c of a permanent equation ``(m,)``.
+        tangent: number of the direction along the target, -1 for all other rows ``(m,)``.
+        moved: rows of P if their weights differ; None if P has the same rows.
+        tilt: what friction adds to the rows of slipping contactors in Q, zero for all others; None if no rank has any.
+        resisted: rows of relative motions that contact and friction resist ``(m,)``; None without friction, for the active ones.
+        crosswise: rows across the slip of slipping contactors in 3D, for bodies that only contact holds; None without such.
     """
 
-    trial: UnitingEquations
-    test: UnitingEquations
-    frictionless: UnitingEquations
-    resisting: UnitingEquations
-    stopping: UnitingEquations
+    rows: UnitingEquations
     contactor: Ints
     kind: Ints
     tangent: Ints
+    moved: UnitingEquations | None = None
+    tilt: UnitingEquations | None = None
+    resisted: Bools | None = None
+    crosswise: UnitingEquations | None = None
 
     @classmethod
-    def without_friction(cls, trial: UnitingEquations, test: UnitingEquations, contactor: Ints, kind: Ints) -> Constraints:
-        """Equations in the normal direction only."""
-        return cls(trial, test, test, trial, trial, contactor, kind, np.full(len(kind), -1))
+    def straight(cls, rows: UnitingEquations, contactor: Ints, kind: Ints, moved: UnitingEquations | None = None) -> ContactRows:
+        """Rows without directions along the target."""
+        return cls(rows, contactor, kind, np.full(len(rows), -1), moved)
+
+    @classmethod
+    def join(cls, parts: Sequence[ContactRows], more: Sequence[UnitingEquations], block: int) -> ContactRows:
+        """All rows of several lists, followed by ``more`` equations of users."""
+        parts = [*parts, *(cls.straight(e, *np.full((2, len(e)), -1)) for e in more)]
+
+        def lists(of: Callable[[ContactRows], UnitingEquations]) -> UnitingEquations:
+            return UnitingEquations.join([of(p) for p in parts], block)
+
+        def some(name: str) -> bool:
+            return any(getattr(p, name) is not None for p in parts)
+
+        numbers = [np.stack((p.contactor, p.kind, p.tangent)) for p in parts]
+        contactor, kind, tangent = np.concatenate([np.zeros((3, 0), np.int64), *numbers], axis=1)
+        return cls(
+            lists(lambda p: p.rows),
+            contactor,
+            kind,
+            tangent,
+            moved=lists(lambda p: p.P) if some("moved") else None,
+            tilt=lists(lambda p: p.tilt or without_terms(p.rows)) if some("tilt") else None,
+            resisted=np.concatenate([p.resisting.active for p in parts]) if some("resisted") else None,
+            crosswise=UnitingEquations.join([p.crosswise for p in parts if p.crosswise], block) if some("crosswise") else None,
+        )
 
     @property
-    def tied(self) -> Bools:
-        """Which of the equations are permanent ``(m,)``."""
-        return np.zeros(len(self), dtype=bool)
+    def P(self) -> UnitingEquations:
+        """Rows for the motion of contactors, ``du = P dq + c``."""
+        return self.rows if self.moved is None else self.moved
+
+    @cached_property
+    def Q(self) -> UnitingEquations:
+        """Rows for the distribution of contact forces, ``Q'r = 0``."""
+        r, t = self.rows, self.tilt
+        if t is None:
+            return r
+        return replace(
+            r,
+            direction=r.direction + t.direction,
+            row=np.append(r.row, t.row),
+            followed=np.append(r.followed, t.followed),
+            coefficients=np.append(r.coefficients, t.coefficients, axis=0),
+        )
 
     @property
-    def contact(self) -> Constraints:
-        """Equations of contactors in contact, which come first."""
-        return self
+    def resisting(self) -> UnitingEquations:
+        """Rows of P for all relative motions that contact and friction resist."""
+        return self.P if self.resisted is None else replace(self.P, active=self.resisted)
 
-    def across(self) -> Constraints:
-        """The test rows in the normal direction, without friction."""
-        which = self.tangent < 0
-        rows = self.frictionless.select(which)
-        return Constraints.without_friction(rows, rows, self.contactor[which], self.kind[which])
+    @property
+    def stopping(self) -> UnitingEquations:
+        """Rows that restrain rigid-body motions; those of P come last."""
+        return self.P if self.crosswise is None else UnitingEquations.join([self.crosswise, self.P], self.P.direction.shape[1])
+
+    @property
+    def normal(self) -> Bools:
+        """Rows along contact normals ``(m,)``."""
+        return (self.kind == NORMAL) & (self.tangent < 0)
+
+    @property
+    def permanent(self) -> Bools:
+        """Rows of tied contactors and of users ``(m,)``."""
+        return self.kind < 0
 
     def __len__(self) -> int:
-        return len(self.contactor)
+        return len(self.rows)
+
+
+def without_terms(rows: UnitingEquations) -> UnitingEquations:
+    """As many rows at the same nodes, with zero directions and no terms."""
+    none = rows.select(np.zeros(len(rows), bool))
+    return replace(rows, direction=0.0 * rows.direction, row=none.row, followed=none.followed, coefficients=none.coefficients)
 
 
 @dataclass(frozen=True)
@@ -155,15 +208,15 @@ class GapRows:
         along, against = multipliers[own, None] * eq.direction[own], -multipliers[eq.row[terms], None] * eq.coefficients[terms]
         return nodes, np.concatenate([along, against])
 
-    def select(self, which: Ints, active: Bools) -> Constraints:
+    def select(self, which: Ints, active: Bools) -> ContactRows:
         """Rows of the contactors ``which (k,)``; rows of ``active (n,)`` contactors are active."""
         chosen = np.zeros(len(self.scale), dtype=bool)
         chosen[which] = True
         rows = chosen[self.contactor]
         contactor = self.contactor[rows]
-        test = replace(self.equations.select(rows), active=active[contactor])
-        trial = test if self.moved is None else replace(self.moved.select(rows), active=test.active)
-        return Constraints.without_friction(trial, test, contactor, self.kind[rows])
+        along = replace(self.equations.select(rows), active=active[contactor])
+        moved = None if self.moved is None else replace(self.moved.select(rows), active=along.active)
+        return ContactRows.straight(along, contactor, self.kind[rows], moved)
 
     def normal_return(self, active: Bools) -> Array:
         """Displacements of free components ``(n, gdim)`` that close the gaps of ``active (n,)`` contactors along their rows [UEM, 4.2]."""
@@ -239,8 +292,8 @@ class Kinematics(Protocol):
     def gap_rows(self) -> GapRows:
         """Rows of all contactors; made once."""
 
-    def forces(self, state: PairState, equations: Constraints, multipliers: Array) -> Traction:
-        """Normal contact forces from the multipliers of equations ``(m,)`` (collective)."""
+    def forces(self, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
+        """Normal contact forces from the multipliers of rows ``(m,)``, of which only those across the target count (collective)."""
 
     def nodal_friction(self, tau: Array) -> Array:
         """Forces at the contactors from multipliers ``tau (n, gdim)`` of tangential rows ``(n, gdim)`` (collective)."""

@@ -23,7 +23,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.conductance import Conductance, value
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
-from uem_dolfinx.contact.seam.placement import NORMAL, Constraints, Discretisation, Kinematics
+from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows, Discretisation, Kinematics
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.thermal.sides import Sides, sides_of
 from uem_dolfinx.errors import InputError, SpaceError
@@ -339,7 +339,7 @@ class Heat:
             found.append(_dyads(slopes, jumps, Terms(at.row, at.node, opening)))
         return found
 
-    def by_forces(self, equations: Constraints, lift: Array) -> tuple[Ints, Array]:
+    def by_forces(self, equations: ContactRows, lift: Array) -> tuple[Ints, Array]:
         """Derivatives of the residual by forces F at the contactors, with multipliers ``lift F``; see ``tangent`` (collective).
 
         They are neglected at degree 2, where each pressure depends on the forces of several contactors.

@@ -175,9 +175,8 @@ class Preloaded(Tie):
         )
         return made.select(others), i[others], c[others]
 
-    def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
+    def _bond(self, bond: Array) -> Array:
         """See ``Tie``; the leading row carries the rest of the given force (collective)."""
-        bond = super()._bond(contactor, kind, multipliers)
         return bond if self.locked else bond + self._by_lead(self.force - self._pull(bond))
 
     def _pull(self, bond: Array) -> float:

@@ -7,7 +7,7 @@ open at the time of tying remain in contact.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import Constraints, Discretisation, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Traction
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.ties.tied_rows import TiedRows, to_facets, to_means, to_surface
 from uem_dolfinx.errors import SurfaceError
@@ -26,39 +26,6 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import agree, reduced
-
-
-@dataclass(frozen=True)
-class TiedConstraints(Constraints):
-    """``Constraints`` of contactors in contact, followed by those of tied contactors.
-
-    Attributes:
-        first: constraints of contactors in contact.
-    """
-
-    first: Constraints
-
-    @property
-    def contact(self) -> Constraints:
-        """See ``Constraints``."""
-        return self.first
-
-    @property
-    def tied(self) -> Bools:
-        """See ``Constraints``."""
-        return np.arange(len(self)) >= len(self.first)
-
-    @classmethod
-    def join(cls, contact: Constraints, tied: UnitingEquations, contactor: Ints, kind: Ints) -> TiedConstraints:
-        """Join both; ``contactor`` and ``kind`` are contactors and components of the tied equations ``(m,)``."""
-        g, made = tied.direction.shape[1], dict[int, UnitingEquations]()
-        lists = [contact.trial, contact.test, contact.frictionless, contact.resisting, contact.stopping]
-        for own in lists:
-            made.setdefault(id(own), UnitingEquations.join([own, tied], g))
-        pairs = ((contact.contactor, contactor), (contact.kind, kind), (contact.tangent, np.full(len(kind), -1)))
-        contactor, kind, tangent = (np.concatenate(pair) for pair in pairs)
-        trial, test, frictionless, resisting, stopping = (made[id(own)] for own in lists)
-        return cls(trial, test, frictionless, resisting, stopping, contactor, kind, tangent, contact)
 
 
 class Tie:
@@ -241,9 +208,12 @@ class Tie:
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
-    def join(self, contact: Constraints) -> Constraints:
+    def join(self, contact: ContactRows) -> ContactRows:
         """Equations of contact, followed by those of tied contactors (collective)."""
-        return contact if self.rows is None else TiedConstraints.join(contact, *self._uniting())
+        if self.rows is None:
+            return contact
+        here, i, c = self._uniting()
+        return ContactRows.join([contact, ContactRows.straight(here, i, -1 - c)], [], self.config.gdim)
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
         """Equations of tied contactors, with their contactors and components ``(m,)`` (collective)."""
@@ -251,24 +221,26 @@ class Tie:
         i, c = np.nonzero(self.rows.has)
         return self._equations(), i, c
 
-    def set_redundant(self, equations: Constraints, redundant: Bools) -> None:
+    def set_redundant(self, equations: ContactRows, redundant: Bools) -> None:
         """Set which of the equations ``(m,)`` are redundant and were dropped."""
-        k = len(equations.contact)
-        self._left_out = np.zeros_like(self._left_out)
-        self._left_out[equations.contactor[k:], equations.kind[k:]] = redundant[k:]
+        self._left_out = self._of_components(equations, redundant)
 
-    def with_forces(self, contact: Traction, equations: Constraints, multipliers: Array) -> Traction:
+    def _of_components(self, equations: ContactRows, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values of equations ``(m,)`` at the tied contactors' components ``(n, gdim)``."""
+        found, tied = np.zeros(self._left_out.shape, values.dtype), equations.permanent
+        found[equations.contactor[tied], -1 - equations.kind[tied]] = values[tied]
+        return found
+
+    def with_forces(self, contact: Traction, equations: ContactRows, multipliers: Array) -> Traction:
         """Contact forces, and tie forces from the multipliers of all equations ``(m,)`` (collective)."""
-        if equations.contact is equations:
-            return contact._replace(bond=np.zeros(self._left_out.shape))
-        k = len(equations.contact)
-        bond = self._bond(equations.contactor[k:], equations.kind[k:], multipliers[k:])
+        bond = self._of_components(equations, multipliers)
+        if self.rows is None:
+            return contact._replace(bond=bond)
+        bond = self._bond(bond)
         return contact._replace(force=contact.force + self._on_contactors(bond), bond=bond)
 
-    def _bond(self, contactor: Ints, kind: Ints, multipliers: Array) -> Array:
-        """Multipliers of tied contactors ``(n, gdim)``, from those of the equations of ``_uniting (m,)`` (collective)."""
-        bond = np.zeros(self._left_out.shape)
-        bond[contactor, kind] = multipliers
+    def _bond(self, bond: Array) -> Array:
+        """Multipliers of tied contactors, from those of the equations of ``_uniting``, each ``(n, gdim)`` (collective)."""
         return bond
 
     def _on_contactors(self, bond: Array) -> Array:

@@ -19,6 +19,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.pair.interface import Interface, in_question
 from uem_dolfinx.contact.seam.active_set import TOUCHING
+from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.form_checks import takes_values
 from uem_dolfinx.log import logger
@@ -181,20 +182,20 @@ class FloatingBodies:
         if far > THROWN * else_ + TOUCHING * config.size:
             raise motions.thrown(thrown, THROWN * else_)
 
-    def hold(self, free: Bools, equations: UnitingEquations, resisting: UnitingEquations) -> Bools:
+    def hold(self, free: Bools, rows: ContactRows) -> Bools:
         """Free components ``(n_rows, gdim)`` without the supports that hold neutral motions (collective).
 
         Args:
             free: components without Dirichlet condition ``(n_rows, gdim)``.
-            equations: rows of the relative motions that contacts bound.
-            resisting: rows of all relative motions that contacts resist; the same object without friction.
+            rows: of all pairs, then of users.
         """
         if self.motions is None:
             return free
+        equations = rows.stopping
         self._open = self._sliding = self.motions.open_motions(self._rates(equations))
-        if resisting is not equations and self.neutral:
+        if rows.resisted is not None and self.neutral:
             # friction resists more motions, never fewer
-            self._open = self.motions.open_motions(self._rates(resisting))
+            self._open = self.motions.open_motions(self._rates(rows.resisting))
         rigid, parted = None if self._linear is None else self._linear.rigid, None
         if rigid is not None:
             # supports may use the components that rigid couplings leave of their nodes
@@ -323,7 +324,7 @@ class FloatingBodies:
         more = [] if self._linear is None else [self._linear.at_present()]
         rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
         # sticking contactors are held in all directions; contactors without friction may separate again
-        firm = [(e.tied | pair.frictional)[e.resisting.active] for pair, e in zip(pairs, equations)]
+        firm = [(e.permanent | pair.frictional)[e.resisting.active] for pair, e in zip(pairs, equations)]
         which = np.concatenate([np.zeros(0, bool), *firm, *(np.ones(len(e), bool) for e in more)])
         rates = motions.rates(rows)
         return _Held(rows, rates, which, motions.open_motions(rates[which]))

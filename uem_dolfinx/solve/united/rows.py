@@ -17,7 +17,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DependentRingError
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.contact.seam.placement import Constraints, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, Traction
 from uem_dolfinx.errors import ConflictError, FrictionError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes
@@ -135,28 +135,25 @@ class Rows:
 
     Attributes:
         pairs: with equations.
-        equations: of each pair; in P and Q the equations of users follow.
-        trial: all equations of P; None if P is ``frictionless``.
+        equations: of each pair.
+        whole: those of all pairs together, then of temperatures and of users.
         independent: resolution of conflicts; None if there cannot be any.
         test: Q.
         frictionless: Q without the friction of slipping contactors; it also closes the gaps.
-        heat: equations of temperatures by number of their pair, each of one field; they come after ``equations`` and before the
-            equations of users.
+        heat: equations of temperatures by number of their pair, each of one field.
         rigid: rigid couplings, whose equations come last, or None.
-        given: equations of Q before they were rewritten for the rigid couplings, or None.
     """
 
     pairs: Sequence[Interface]
-    equations: list[Constraints]
-    trial: UnitingEquations | None
+    equations: list[ContactRows]
+    whole: ContactRows
     independent: IndependentEquations | None
     test: Restriction
     frictionless: Restriction
     heat: dict[int, list[HeatEquations]]
     rigid: RigidNodes | None = None
-    given: UnitingEquations | None = None
 
-    def of(self, pairs: Sequence[Interface]) -> list[Constraints]:
+    def of(self, pairs: Sequence[Interface]) -> list[ContactRows]:
         """Equations of each of these pairs; empty for pairs without equations."""
         known = {id(pair): own for pair, own in zip(self.pairs, self.equations)}
         none = np.zeros(0, np.int64)
@@ -197,7 +194,7 @@ class BodyState(IterationState):
 def make_rows(
     over_constraints: OverConstraints,
     pairs: Sequence[Interface],
-    hold: Callable[[UnitingEquations, UnitingEquations], Bools],
+    hold: Callable[[ContactRows], Bools],
     prescribed: Array,
     linear: UserRows | None = None,
 ) -> Rows:
@@ -206,7 +203,7 @@ def make_rows(
     Args:
         over_constraints: of the pairs.
         pairs: that may be in contact.
-        hold: returns the free components ``(n_rows, gdim)``, from the rows of motions that contacts bound, and of all that they resist.
+        hold: returns the free components ``(n_rows, gdim)``, from the rows of all pairs and of users.
         prescribed: increments prescribed by Dirichlet conditions ``(n_rows, gdim)``.
         linear: equations of users, or None.
 
@@ -217,27 +214,17 @@ def make_rows(
     for pair in rigid if over_constraints.shared else ():
         pair.meet([other for other in rigid if other is not pair])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
-    united = ((i, _united_fields(pair)) for i, pair in enumerate(pairs))
-    heat = {i: [one.equations() for one in fields] for i, fields in united if fields}
+    fields = ((i, _united_fields(pair)) for i, pair in enumerate(pairs))
+    heat = {i: [one.equations() for one in own] for i, own in fields if own}
     users = [] if linear is None else [linear.at_present()]
-    more = [*(e.rows for fields in heat.values() for e in fields), *users]
-    frictionless = trial = UnitingEquations.join([*(e.frictionless for e in equations), *more], g)
-    if any(e.trial is not e.frictionless for e in equations):
-        trial = UnitingEquations.join([*(e.trial for e in equations), *more], g)
-    resisting = stopping = trial
-    if heat or any(e.resisting is not e.trial for e in equations):
-        resisting, stopping = (
-            UnitingEquations.join([*parts, *users], g)
-            for parts in ([e.resisting for e in equations], [e.stopping for e in equations])
-        )
+    united = [e.rows for own in heat.values() for e in own]
+    whole = ContactRows.join(equations, [*united, *users], g)
     # the derivatives of the gaps determine the open motions of a body
-    free = hold(stopping, resisting)
-    Q, independent = over_constraints.restrict(frictionless, free, prescribed)
-    given = frictionless
+    free = hold(ContactRows.join(equations, users, g) if united else whole)
+    Q, independent = over_constraints.restrict(whole.rows, free, prescribed)
     rotated = Q
-    if any(e.test is not e.frictionless for e in equations):
-        given = UnitingEquations.join([*(e.test for e in equations), *more], g)
-        test, last = over_constraints.parted(given)
+    if whole.tilt is not None:
+        test, last = over_constraints.parted(whole.Q)
         if independent is not None and independent.found:
             independent = _rotated(pairs, independent, test)
             test = independent.equations
@@ -246,18 +233,7 @@ def make_rows(
         except DependentRingError as error:
             _refuse_wedged(pairs, test, error.rows[: len(test)])
             raise
-    couplings = None if linear is None else linear.rigid
-    return Rows(
-        pairs,
-        equations,
-        None if trial is frictionless else trial,
-        independent,
-        rotated,
-        Q,
-        heat,
-        couplings,
-        None if couplings is None else given,
-    )
+    return Rows(pairs, equations, whole, independent, rotated, Q, heat, None if linear is None else linear.rigid)
 
 
 def _surfaces(pairs: Sequence[Interface]) -> tuple[list[Indices], Ints]:
@@ -304,8 +280,8 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
             powers.append(heat.read(equations, lam[part], redundant[part]))
             start = part.stop
         found[i] = found[i]._replace(heat=np.column_stack(powers))
-    if rows.rigid is not None and rows.given is not None:
-        last = rows.rigid.beside(last, rows.given.select(np.arange(len(rows.given)) < len(lam)), lam)
+    if rows.rigid is not None:
+        last = rows.rigid.beside(last, rows.whole.Q.select(np.arange(len(rows.whole)) < len(lam)), lam)
     known = dict(zip(map(id, rows.pairs), found))
     return [known.get(id(pair)) or pair.traction for pair in pairs], np.append(lam[start:], last)
 

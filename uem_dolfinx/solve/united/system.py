@@ -261,7 +261,7 @@ class BodySystem:
         """P, terms of the slip directions in tangent and residual, number of active contactors, and their largest gap (collective)."""
         # if equations conflict, P might eliminate other components than Q
         contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
-        apart = None if contested else rows.trial
+        apart = None if contested else rows.whole.moved
         self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
         trial = rows.frictionless
         if apart is not None:
