@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -41,38 +43,30 @@ def with_friction(
     """
     comm, g = frame.ties.config.comm, normal.shape[1]
     contactor = own.contactor[own.kind == NORMAL]
-    first, m, node = len(contactor), len(own) + (g - 1) * len(contactor), own.rows.node[: len(contactor)]
-    place = np.full(len(normal), -1, dtype=np.int64)
-    place[contactor] = np.arange(first)
-
-    def along(t: Array, ties: Ties, active: Bools, gap: Array | None = None) -> UnitingEquations:
-        there = place[ties.row] >= 0
-        row, weight = place[ties.row[there]], ties.weight[there, None]
-        gap = np.zeros(first) if gap is None else gap
-        return UnitingEquations(node, t, gap, active, row, ties.followed[there], weight * t[row])
-
-    T, of_friction, stick = frame.free_tangents[contactor], of_friction[contactor], stick[contactor]
-    away = np.einsum("nrg,ng->nr", T, frame.away[contactor])
-    resisted = [of_friction & T[:, r].any(axis=1) for r in range(g - 1)]
-
-    def with_those_along(rows: UnitingEquations, ties: Ties) -> UnitingEquations:
-        return UnitingEquations.join([rows, *(along(T[:, r], ties, resisted[r] & stick, away[:, r]) for r in range(g - 1))], g)
-
-    rows, slipping, s = with_those_along(own.rows, frame.ties), of_friction & ~stick, directions[contactor]
-    turned, moved, tilt = np.where(slipping[:, None], -slope[contactor, None] * s, 0.0), None, None
+    none, place = np.zeros(m := len(contactor)), np.full(len(normal), -1, dtype=np.int64)
+    place[contactor] = np.arange(m)
+    T, of_friction, stick, s = (of_all[contactor] for of_all in (frame.free_tangents, of_friction, stick, directions))
+    slipping, away = of_friction & ~stick, np.einsum("nrg,ng->nr", T, frame.away[contactor])
+    turned = np.where(slipping[:, None], -slope[contactor, None] * s, 0.0)
     slips = reduced(comm, bool(turned.any()), op=MPI.LOR)
     # rows of sticking contactors are the same in P and Q if they have the current weights
-    if own.moved is not None or not (pointwise or (keeps_ties and not slips)):
-        moved = with_those_along(own.P, frame.ties if pointwise else frame.way)
+    apart = not pointwise and (own.moved is not None or slips or not keeps_ties)
+
+    def along(t: Array, gap: Array, active: Bools, ties: Ties) -> UnitingEquations:
+        there = place[ties.row] >= 0
+        row, weight = place[ties.row[there]], ties.weight[there, None]
+        return UnitingEquations(own.rows.node[:m], t, gap, active, row, ties.followed[there], weight * t[row])
+
+    def tangential(r: int) -> ContactRows:
+        resisted = of_friction & T[:, r].any(axis=1)
+        here = along(T[:, r], away[:, r], resisted & stick, frame.ties)
+        moved = along(T[:, r], away[:, r], resisted & stick, frame.way) if apart else None
+        return ContactRows(here, contactor, np.full(m, NORMAL), np.full(m, r), moved, None, resisted)
+
+    tilt = crosswise = None
     if slips:
-        tilt = UnitingEquations.join([along(turned, frame.ties, slipping), without_terms(rows.select(np.arange(m) >= first))], g)
-    return ContactRows(
-        rows,
-        np.concatenate([own.contactor, *[contactor] * (g - 1)]),
-        np.concatenate([own.kind, np.full(m - len(own), NORMAL)]),
-        np.concatenate([own.tangent, *(np.full(first, r) for r in range(g - 1))]),
-        moved,
-        tilt,
-        np.concatenate([own.rows.active, *resisted]),
-        along(cross_products(normal[contactor], s), frame.ties, slipping) if g == 3 else None,
-    )
+        rest = without_terms(own.rows.select(np.arange(len(own)) >= m))
+        tilt = UnitingEquations.join([along(turned, none, slipping, frame.ties), rest], g)
+    if g == 3:
+        crosswise = along(cross_products(normal[contactor], s), none, slipping, frame.ties)
+    return ContactRows.join([replace(own, tilt=tilt, crosswise=crosswise), *(tangential(r) for r in range(g - 1))], [], g)
