@@ -102,6 +102,28 @@ def test_a_block_that_is_warmed_slides(cell, how):
     assert c.balance().force < 1e-13 and c.heat_balance() < 1e-13
 
 
+@pytest.mark.parametrize(
+    ("cell", "h"), [("triangle", 20.0), ("quadrilateral", 20.0), ("tetrahedron", 200.0), slow("tetrahedron", 20.0)]
+)
+def test_a_conductance_by_the_pressure(cell, h):
+    """Heat that passes by the pressure, and warms what presses: with friction in as few iterations as without, by exact derivatives."""
+    for mu in (0.0, 0.3, 5.0):
+        b = blocks(COMM, cell, 3, 3, overhang=0.5)
+        f, g = fields(b, 1, 1), b.gdim
+        (u, T), (v, q) = f.split(f.w), f.split(ufl.TestFunction(f.w.function_space))
+        warmed = stress(u, 10.0, 0.3) - 0.02 * T * ufl.Identity(g)
+        F = (ufl.inner(warmed, strain(v)) + K * ufl.inner(ufl.grad(T), ufl.grad(q))) * ufl.dx
+        bcs = [uem.dirichlet(f.space, b.bottom, c) for c in range(g)]
+        bcs += [uem.dirichlet(f.space, b.top, c, value) for c, value in enumerate([0.02, *[0.0] * (g - 2), -0.02])]
+        bcs += [uem.dirichlet(f.other, part, value=value) for part, value in ((b.bottom, 0.0), (b.top, 100.0))]
+        heat = uem.Conductance(lambda p, gap: h * p + 0.0 * gap, field=1)
+        contact = uem.Contact(b.high, b.low, friction=mu, heat=heat)
+        (step,) = uem.load_steps(uem.UnitedProblem(F, f.w, displacement=0, bcs=bcs, contacts=[contact], rtol=1e-12), 1)
+        assert step.newton_iterations <= 9 and contact.heat_balance() < 1e-12
+        if mu == 5.0:
+            assert highest(COMM, contact.status.x.array[contact.nodes]) == 1.0
+
+
 @pytest.mark.parametrize("coupling", ["mortar", slow("node_to_surface")])
 def test_a_rigid_surface_is_as_warm_as_the_conductance_says(coupling):
     """Resistances of block and contact in series tell the contactors' temperature; without heat it is theirs alone that counts."""

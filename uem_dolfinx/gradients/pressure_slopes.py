@@ -19,7 +19,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows
+from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
 
@@ -84,7 +84,7 @@ class PressureSlopes:
             q.x.array[nodes] = by_areas
             q.x.scatter_forward()
             areas = self.contact.surface.integral(q, self._current)
-        return PressureWeights(np.where(eq.kind == NORMAL, own[eq.contactor], 0.0), areas, now, drawn)
+        return PressureWeights(np.where(eq.normal, own[eq.contactor], 0.0), areas, now, drawn)
 
     def along(self, multipliers: Array, du: fem.Function, shape: fem.Function) -> Array:
         """Changes of the pressures of this rank's contactors ``(n,)`` (collective).

@@ -23,7 +23,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.conductance import Conductance, value
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
-from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows, Discretisation, Kinematics
+from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.thermal.sides import Sides, sides_of
 from uem_dolfinx.errors import InputError, SpaceError
@@ -350,7 +350,7 @@ class Heat:
         """
         pair, config = self._pair, self._pair.config
         slopes = np.where(pair.trial.active & (config.degree == 1), self._slopes(), 0.0)
-        weights, own = slopes * self._per_area() * self.passage.force, equations.kind == NORMAL
+        weights, own = slopes * self._per_area() * self.passage.force, equations.normal
         which = equations.contactor[own]
         return _dyads(weights, self._jumps(), Terms(which, config.to_global(pair.nodes[which]), lift[own]))
 
