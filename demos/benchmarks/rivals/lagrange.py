@@ -66,7 +66,7 @@ class LagrangeSystem(BodySystem):
         if iteration is not None:
             self._differentiate(first=iteration == 0)
         curvature = self.curvature
-        equations = UnitingEquations.join([pair.equations().trial for pair in self.pairs], self.config.gdim)
+        equations = UnitingEquations.join([pair.equations().P for pair in self.pairs], self.config.gdim)
         equations = equations.select(equations.active)
         self._c = self.config.vector(self.bodies.prescribed)
         if curvature is None and not any(pair.sliding == "finite" for pair in self.pairs):
