@@ -303,7 +303,7 @@ def tie(a, b, c):
 
 
 def united(rows):
-    """Groups of nodes that equations, each a list of a node and its coefficients, give one displacement."""
+    """Groups of nodes 2, 5 and 7 that equations, each a list of a node and its coefficients, give one displacement."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [3, 3])])
     config = configuration_of(compat.function_space(s.mesh, 1, (2,)))
     # each rank has some
@@ -311,9 +311,11 @@ def united(rows):
     row, value = np.repeat(np.arange(len(mine)), [len(one) for one in mine]).astype(np.int64), np.zeros(len(mine), np.int64)
     node = np.array([node for one in mine for node, _ in one], dtype=np.int64)
     c = np.array([c for one in mine for _, c in one], dtype=float).reshape(-1, 2)
-    seams = Seams(config, [GivenRows(value, row, node, c)])
-    others = COMM.allreduce(sum(len(np.unique(row)) for row, _ in seams.others))
-    return {frozenset(seams.node[seams.group == k].tolist()) for k in np.unique(seams.group)}, others
+    seams = Seams([GivenRows(value, row, node, c)])
+    asked = np.array([2, 5, 7]) - config.first
+    known, group = seams.groups(config, asked[(asked >= 0) & (asked < config.n_owned)])
+    others = COMM.allreduce(sum(len(np.unique(row)) for row, _ in seams.others(known, group)))
+    return {frozenset(known[group == k].tolist()) for k in np.unique(group)}, others
 
 
 @pytest.mark.parametrize(
@@ -321,7 +323,9 @@ def united(rows):
     [
         ([], [], 0),
         ([tie(3, 7, X), tie(7, 3, Y)], [{3, 7}], 0),
-        ([tie(3, 7, X), tie(3, 7, Y), tie(7, 2, X), tie(7, 2, Y), tie(0, 1, X), tie(0, 1, Y)], [{2, 3, 7}, {0, 1}], 0),
+        ([tie(3, 7, X), tie(3, 7, Y), tie(7, 2, X), tie(7, 2, Y), tie(0, 1, X), tie(0, 1, Y)], [{2, 3, 7}], 2),
+        # a group that goes on in nodes that are not asked about
+        (sum(([tie(a, b, X), tie(a, b, Y)] for a, b in ((2, 0), (3, 1), (1, 4), (4, 7), (0, 3))), []), [{0, 1, 2, 3, 4, 7}], 0),
         # a component alone, a rotation, the opposite, a multiple, a mean
         ([tie(3, 7, X)], [], 1),
         ([[(3, X), (7, Y)], [(3, Y), (7, (-1.0, 0.0))]], [], 2),

@@ -8,54 +8,75 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.conditions.equation import GivenRows, LinearEquations
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.parallel import reduced
 
 
 class Seams:
-    """Groups of nodes with one displacement, equal on all ranks (collective).
+    """Equations of users by which two nodes have one displacement, up to a jump; each rank has those that were given on it.
 
     Args:
-        space: the nodes.
         given: equations of this rank, several lists.
 
     Attributes:
         given: the same.
-        node: global nodes ``(k,)``, ascending.
-        group: number of the group of each ``(k,)``.
-        others: row and global node of each term of this rank's equations that are not of such a group, list by list.
     """
 
-    def __init__(self, space: Nodes, given: Sequence[GivenRows]):
+    def __init__(self, given: Sequence[GivenRows]):
+        self.given = given
+        self._terms = [_of_something(one.row, one.node, one.coefficients) for one in given]
+        self._alike = np.concatenate([np.zeros((0, 3), np.int64), *(_differences(*terms) for terms in self._terms)])
+
+    def groups(self, space: Nodes, nodes: Indices) -> tuple[Ints, Ints]:
+        """Groups of nodes with one displacement, those with one of the given nodes, equal on all ranks (collective).
+
+        Args:
+            space: all nodes.
+            nodes: owned ones, of a contactor ``(n,)``.
+
+        Returns:
+            Global nodes ``(k,)``, ascending, and the number of the group of each ``(k,)``.
+        """
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
-        self.given, equations = given, [_of_something(one.row, one.node, one.coefficients) for one in given]
-        found = [_differences(*one) for one in equations]
-        every = np.unique(np.concatenate(space.comm.allgather(np.concatenate([np.zeros((0, 3), np.int64), *found]))), axis=0)
+        here, before, ends = np.zeros((space.n_owned, 1)), -1, self._alike[:, :2]
+        here[nodes] = 1.0
+        # a group may go on in nodes that are no contactors
+        while (marked := int(reduced(space.comm, int(here.sum())))) > before:
+            some = space.ask_owners(ends.ravel(), here).reshape(-1, 2).any(axis=1)
+            reached = space.add_at_owners(ends[some].ravel(), np.ones((2 * some.sum(), 1)))
+            here, before = np.sign(here + reached), marked
+        every = np.unique(np.concatenate(space.comm.allgather(self._alike[some])), axis=0)
         pairs, count = np.unique(every[:, :2], axis=0, return_counts=True)
         pairs = pairs[count == space.block]
-        self.node, at = np.unique(pairs, return_inverse=True)
+        node, at = np.unique(pairs, return_inverse=True)
         start, end = at.reshape(pairs.shape).T
-        n = len(self.node)
-        self.group = connected_components(coo_matrix((np.ones(len(start)), (start, end)), (n, n)), directed=False)[1].astype(int)
-        self.others = [self._others(row, node) for row, node, _ in equations]
+        n = len(node)
+        graph = coo_matrix((np.ones(len(start)), (start, end)), (n, n))
+        return node, connected_components(graph, directed=False)[1].astype(int)
 
-    def _others(self, row: Ints, node: Ints) -> tuple[Ints, Ints]:
-        """Terms of the equations that are not between two nodes of one group."""
-        group, m = groups_of(node, self.node, self.group), int(row.max(initial=-1)) + 1
-        lowest = np.full(m, len(self.node))
-        np.minimum.at(lowest, row, group)
-        alike = (lowest >= 0) & (np.bincount(row, group != lowest[row], m) == 0)
-        return row[~alike[row]], node[~alike[row]]
+    def others(self, known: Ints, group: Ints) -> list[tuple[Ints, Ints]]:
+        """Row and global node of each term that is not between nodes of one group, list by list; arguments as from ``groups``."""
+        return [_others(row, groups_of(node, known, group), len(known), node) for row, node, _ in self._terms]
+
+
+def _others(row: Ints, group: Ints, highest: int, node: Ints) -> tuple[Ints, Ints]:
+    """Terms of the equations that are not between two nodes of one group."""
+    m = int(row.max(initial=-1)) + 1
+    lowest = np.full(m, highest)
+    np.minimum.at(lowest, row, group)
+    alike = (lowest >= 0) & (np.bincount(row, group != lowest[row], m) == 0)
+    return row[~alike[row]], node[~alike[row]]
 
 
 def note_seams(config: Configuration, equations: Sequence[LinearEquations], contacts: Sequence[Any]) -> None:
     """Set the configuration's ``seams`` if there are equations of users and contacts, before these are made (collective)."""
     if equations and contacts:
-        config.seams = Seams(config, [one.rows(config, f"equations[{i}]") for i, one in enumerate(equations)])
+        config.seams = Seams([one.rows(config, f"equations[{i}]") for i, one in enumerate(equations)])
 
 
 def groups_of(nodes: Ints, known: Ints, group: Ints) -> Ints:

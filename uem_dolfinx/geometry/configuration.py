@@ -34,7 +34,7 @@ class Configuration(Nodes):
     moves = True
     #: Name of the solution in results and checkpoints.
     name = "displacement"
-    #: Nodes that equations of users give one displacement, see ``conditions.seams.Seams``; None without equations or contacts.
+    #: Equations of users that give nodes one displacement, a ``conditions.seams.Seams``; None without equations or contacts.
     seams: Any = None
 
     def __init__(self, u: fem.Function):

@@ -99,7 +99,7 @@ class Elimination:
     Args:
         config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
-        seams: nodes of one displacement, or None.
+        seams: equations that give nodes one displacement, or None.
 
     Attributes:
         seam: contactors of one displacement.

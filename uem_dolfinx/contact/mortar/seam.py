@@ -16,14 +16,14 @@ class Seam:
     Args:
         space: nodes of the displacement.
         nodes: owned contactor nodes ``(n,)``.
-        seams: of all nodes, or None.
+        seams: equations that make seams, or None.
 
     Attributes:
         sharing: number of contactors with the row of each ``(n,)``.
     """
 
     def __init__(self, space: Nodes, nodes: Indices, seams: Seams | None):
-        node, group = (np.zeros(0, np.int64),) * 2 if seams is None else (seams.node, seams.group)
+        node, group = (np.zeros(0, np.int64),) * 2 if seams is None else seams.groups(space, nodes)
         own = np.isin(node, space.to_global(nodes))
         kept = reduced(space.comm, own) > 0 if seams is not None else own
         kept[kept] = (np.bincount(group[kept]) > 1)[group[kept]]

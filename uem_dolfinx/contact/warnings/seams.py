@@ -8,21 +8,21 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Ints
+from uem_dolfinx.conditions.seams import Seams
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
 
-def warn_of_seams(equations: Sequence[tuple[Ints, Ints]], pairs: Sequence[Interface]) -> None:
+def warn_of_seams(seams: Seams, pairs: Sequence[Interface]) -> None:
     """Warn of equations between contactors of one mortar contact that do not give them one displacement (collective).
 
     Each of these contactors has the row of the segments on its own side, although they move together. The force of both is right up to
     the angle between the normals of the two sides; one contactor has all of it.
 
     Args:
-        equations: row and global node of each term of this rank's equations, list by list.
+        seams: equations of users.
         pairs: of all contacts.
     """
     for pair in pairs:
@@ -32,7 +32,7 @@ def warn_of_seams(equations: Sequence[tuple[Ints, Ints]], pairs: Sequence[Interf
         is_contactor = np.zeros((config.n_owned, 1))
         is_contactor[pair.nodes] = 1.0
         places = []
-        for row, node in equations:
+        for row, node in seams.others(*seams.groups(config, pair.nodes)):
             there = config.ask_owners(node, is_contactor)[:, 0] > 0
             united = np.bincount(row[there]) > 1
             places.append(config.ask_owners(node[there][united[row[there]]], config.X[: config.n_owned]))

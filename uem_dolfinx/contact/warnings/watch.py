@@ -122,7 +122,7 @@ class Watch:
         if contacts and contacts[0].config.seams is not None:
             from uem_dolfinx.contact.warnings.seams import warn_of_seams
 
-            warn_of_seams(contacts[0].config.seams.others, [contact.pair for contact in contacts])
+            warn_of_seams(contacts[0].config.seams, [contact.pair for contact in contacts])
         self._corners: dict[int, tuple[TargetCorners, list[WatchedContact]]] = {}
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
         self._off_at_start: dict[int, Bools] = {}
