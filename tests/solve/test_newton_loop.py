@@ -9,6 +9,7 @@ import pytest
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
+from uem_dolfinx.solve.bodies.bodies import MOST_PAST
 from uem_dolfinx.solve.united.newton import FORCING, Increment, IterationState, LinearisedProblem, solve_united
 
 
@@ -23,6 +24,7 @@ class OneUnknown:
 
     exact, iterative, passing, fits, convex, in_contact = True, False, False, False, False, False
     unknowns = SimpleNamespace(norms=PETSc.Vec.norm, work=PETSc.Vec.dot)
+    most_past = np.inf
 
     def __init__(self, left):
         self.left, self.u, self.solves = left, 0.0, 0
@@ -91,10 +93,17 @@ class OneUnknown:
         return solve_united(self, self, rtol=1e-8, max_iterations=max_iterations, line_search=line_search, verbose=False)
 
 
-@pytest.mark.parametrize(("left", "length"), [(0.3, 1.0), (0.85, 1.0), (0.95, 1.0 / 64), (-0.45, 1.0), (-0.55, 0.5)])
-def test_what_the_line_search_accepts(left, length):
-    """A step that leaves 0.85 of the residual, or 0.45 past its zero, is taken whole; others are shortened."""
+@pytest.mark.parametrize(
+    ("left", "yields", "length"),
+    [
+        (0.3, False, 1.0), (0.85, False, 1.0), (0.95, False, 1.0 / 64), (-0.85, False, 1.0), (-0.95, False, 0.5),
+        (0.85, True, 1.0), (-0.45, True, 1.0), (-0.55, True, 0.5),
+    ],
+)  # fmt: skip
+def test_what_the_line_search_accepts(left, yields, length):
+    """A step that leaves 0.85 of the residual, or 0.45 past its zero where bodies yield, is taken whole; others are shortened."""
     system = OneUnknown(left)
+    system.most_past = MOST_PAST if yields else np.inf
     assert system.loop()[1].step_length == length
 
 

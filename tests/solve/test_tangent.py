@@ -200,12 +200,9 @@ def test_order_of_convergence(cell):
     for consistent in (True, False):
         b, contact, problem = contact_scene(cell, consistent_tangent=consistent, rtol=1e-11, max_iterations=80)
         history = [step.iterations for step in run(problem, 2)]
-        results[consistent] = history, sum(len(h) - 1 for h in history), contact.resultant().force
-    assert max(max(orders(h), default=0.0) for h in results[True][0]) >= 1.8
-    # the second half of the iterations gains about as many digits as the first
-    digits = -np.log([i.residual for i in results[False][0][-1]])
-    half = len(digits) // 2
-    assert digits[-1] - digits[half] < 1.5 * (digits[half] - digits[0])
+        results[consistent] = [orders(h) for h in history], sum(len(h) - 1 for h in history), contact.resultant().force
+    assert max(max(o, default=0.0) for o in results[True][0]) >= 1.8
+    assert results[False][0][-1][-1] < 1.2
     assert results[True][1] < 0.7 * results[False][1]
     assert np.allclose(results[True][2], results[False][2], rtol=1e-7)
 

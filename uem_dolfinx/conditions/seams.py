@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.conditions.equation import GivenRows, LinearEquations
+from uem_dolfinx.conditions.equation import GivenRows
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
@@ -73,10 +72,11 @@ def _others(row: Ints, group: Ints, highest: int, node: Ints) -> tuple[Ints, Int
     return row[~alike[row]], node[~alike[row]]
 
 
-def note_seams(config: Configuration, equations: Sequence[LinearEquations], contacts: Sequence[Any]) -> None:
-    """Set the configuration's ``seams`` if there are equations of users and contacts, before these are made (collective)."""
-    if equations and contacts:
-        config.seams = Seams([one.rows(config, f"equations[{i}]") for i, one in enumerate(equations)])
+def seams_of(config: Configuration) -> Seams | None:
+    """The equations of users with a configuration, or None without any (first time: collective)."""
+    if config.seams is None and config.equations:
+        config.seams = Seams([one.rows(config, f"equations[{i}]") for i, one in enumerate(config.equations)])
+    return config.seams
 
 
 def groups_of(nodes: Ints, known: Ints, group: Ints) -> Ints:

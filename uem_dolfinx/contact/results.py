@@ -16,7 +16,6 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Bools, Indices, cross_products
 from uem_dolfinx.contact.laws.conductance import one_of_fields
-from uem_dolfinx.contact.mortar.seam import Seam
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -26,6 +25,7 @@ from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.laws.conductance import Conductance
+    from uem_dolfinx.contact.mortar.seam import Seam
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,10 @@ class ContactResults:
     @cached_property
     def _seam(self) -> Seam:
         """Contactors that equations of users give one displacement (first time: collective)."""
-        return Seam(self.config, self.nodes, self.config.seams)
+        from uem_dolfinx.conditions.seams import seams_of
+        from uem_dolfinx.contact.mortar.seam import Seam
+
+        return Seam(self.config, self.nodes, seams_of(self.config))
 
     def areas_facing(self, nodes: Indices, normal: Array | None, current: bool) -> Array:
         """Integrals of the shape functions at contactors ``(n,)``, at sharp edges over facets that face the target (collective).

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -34,7 +34,8 @@ class Configuration(Nodes):
     moves = True
     #: Name of the solution in results and checkpoints.
     name = "displacement"
-    #: Equations of users that give nodes one displacement, a ``conditions.seams.Seams``; None without equations or contacts.
+    #: Equations of users, and those that give nodes one displacement, see ``conditions.seams.seams_of``.
+    equations: Sequence[Any] = ()
     seams: Any = None
 
     def __init__(self, u: fem.Function):

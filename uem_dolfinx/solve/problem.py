@@ -10,7 +10,6 @@ import ufl
 from dolfinx import fem
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.conditions.seams import note_seams
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact, parts_of
 from uem_dolfinx.contact.joining import join_alike
@@ -200,7 +199,7 @@ class UnitedProblem(given.Sealed):
         self.solver = solver_of(self.config, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
-        note_seams(self.config, equations, self.contacts)
+        self.config.equations = equations
         for contact in self.contacts:
             contact.attach(self.config, free, **clock)
         refuse_shared_pressures(self.config, self.contacts)

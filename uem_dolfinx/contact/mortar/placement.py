@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, cross_products
+from uem_dolfinx.conditions.seams import seams_of
 from uem_dolfinx.contact.mortar.duals import Basis, basis_of
 from uem_dolfinx.contact.mortar.ends import curvature
 from uem_dolfinx.contact.mortar.rows import Elimination, Remembered, Terms, WeightedRows, terms_of
@@ -42,7 +43,7 @@ class Contactors(OnTarget):
         super().__init__(config, nodes, target, **how)
         self.surface = surface
         self.basis: Basis = basis_of(surface.shape)
-        self.elimination = Elimination(config, nodes, config.seams)
+        self.elimination = Elimination(config, nodes, seams_of(config))
         self.remembered = Remembered(config, nodes, surface)
         self.faced: Ints = np.zeros((0, 2), np.int64)
 

@@ -8,27 +8,26 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.conditions.seams import Seams
+from uem_dolfinx.conditions.seams import seams_of
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
 
-def warn_of_seams(seams: Seams, pairs: Sequence[Interface]) -> None:
+def warn_of_seams(pairs: Sequence[Interface]) -> None:
     """Warn of equations between contactors of one mortar contact that do not give them one displacement (collective).
 
     Each of these contactors has the row of the segments on its own side, although they move together. The force of both is right up to
     the angle between the normals of the two sides; one contactor has all of it.
 
     Args:
-        seams: equations of users.
         pairs: of all contacts.
     """
     for pair in pairs:
-        if not isinstance(pair.discretisation, Contactors):
+        config, seams = pair.config, seams_of(pair.config)
+        if seams is None or not isinstance(pair.discretisation, Contactors):
             continue
-        config = pair.config
         is_contactor = np.zeros((config.n_owned, 1))
         is_contactor[pair.nodes] = 1.0
         places = []

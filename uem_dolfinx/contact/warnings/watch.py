@@ -119,10 +119,10 @@ class Watch:
 
     def __init__(self, contacts: Sequence[WatchedContact]):
         self._contacts = contacts
-        if contacts and contacts[0].config.seams is not None:
+        if contacts and contacts[0].config.equations:
             from uem_dolfinx.contact.warnings.seams import warn_of_seams
 
-            warn_of_seams(contacts[0].config.seams, [contact.pair for contact in contacts])
+            warn_of_seams([contact.pair for contact in contacts])
         self._corners: dict[int, tuple[TargetCorners, list[WatchedContact]]] = {}
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
         self._off_at_start: dict[int, Bools] = {}

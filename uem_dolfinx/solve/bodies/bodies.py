@@ -39,6 +39,10 @@ ABOVE_ROUNDING = 100.0
 #: Dirichlet values are met if they are to this part of the largest.
 #: [derived; the largest prescribed value; test_bodies.py::test_dirichlet_values_are_met]
 VALUE_ROUNDING = 4.0 * np.finfo(float).eps
+#: Past the point where the residual does no more work, a step of bodies that yield may leave this part of it [Matthies and Strang,
+#: International Journal for Numerical Methods in Engineering 14 (1979) 1613-1626]: where it is longer, they yield far too much.
+#: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
+MOST_PAST = 0.5
 
 
 class Bodies:
@@ -169,6 +173,11 @@ class Bodies:
     def linear(self) -> bool:
         """Whether the forces are linear in the displacement."""
         return self.tangent.linear and not self.materials
+
+    @property
+    def most_past(self) -> float:
+        """Part of the residual's work that a step may leave past the point where it does none; see ``MOST_PAST``."""
+        return MOST_PAST if self.materials else np.inf
 
     def update_tangent(self) -> PETSc.Mat:
         """K at the present displacement, and its diagonal (collective)."""

@@ -22,7 +22,6 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.friction.stick_slip import FrictionViolations
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Pivoting, Rule, Violations
 from uem_dolfinx.contact.seam.state import PairState
@@ -205,6 +204,8 @@ class Exchanges:
 
     def _here(self, violated: Sequence[Violations]) -> list[tuple[PairState, Pivot] | None]:
         """States of the pairs with friction, with the predicted normal forces."""
+        from uem_dolfinx.contact.friction.stick_slip import FrictionViolations
+
         here: list[tuple[PairState, Pivot] | None] = []
         for pair, w in zip(self._pairs, violated):
             if pair.friction is None or not isinstance(w, FrictionViolations):

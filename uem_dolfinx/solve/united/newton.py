@@ -34,10 +34,6 @@ LONGEST_SEARCH = 64.0
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
 #: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
 ENOUGH_DECREASE = 0.9
-#: Past the point where the residual does no more work, a step may leave this part of it [Matthies and Strang, International Journal for
-#: Numerical Methods in Engineering 14 (1979) 1613-1626]: before that point a shorter step leaves more, past it less.
-#: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
-ENOUGH_PAST = 0.5
 #: A solve that another iteration follows leaves this part of its right-hand side, times the relative residual [Eisenstat and Walker,
 #: SIAM Journal on Scientific Computing 17 (1996) 16-32]; one that asks which contactors are wrong leaves this part as it is.
 #: [heuristic; right-hand side; test_invariance.py::test_any_pose_and_numbering]
@@ -401,7 +397,7 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
                 return length
             residual = method.reduced_residual(state)
             along, least = work_of(dq, residual), first(state.rounding) * first(norms(dq))
-            enough = ENOUGH_PAST if along * work < 0.0 else ENOUGH_DECREASE
+            enough = min(bodies.most_past, ENOUGH_DECREASE) if along * work < 0.0 else ENOUGH_DECREASE
             less_work = abs(along) <= max(enough * abs(work), least)
             downhill = problem.convex and along < 0.0
             if downhill and not less_work and length == 1.0:

@@ -11,7 +11,6 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.dependent import IndependentEquations
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DependentRingError
@@ -26,6 +25,7 @@ from uem_dolfinx.solve.bodies.tangent import contact_curvature, together
 from uem_dolfinx.solve.united.newton import IterationState
 
 if TYPE_CHECKING:
+    from uem_dolfinx.algebra.dependent import IndependentEquations
     from uem_dolfinx.conditions.user_rows import RigidNodes, UserRows
     from uem_dolfinx.contact.thermal.heat import Heat, HeatEquations
 
@@ -118,15 +118,20 @@ class OverConstraints:
         given, rigid = self.parted(equations)
         firm, g = np.arange(len(given)) >= len(given) - self._n_linear, prescribed.shape[1]
         left = free if self._rigid is None else self._rigid.left(free)
-        independent = IndependentEquations(self._unknowns, given, left, firm=firm) if self.contestable else None
+        independent = self._independent(given, left, None, firm) if self.contestable else None
         own = given if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
         try:
             return Restriction(self._unknowns, joined(own, rigid, g), free, prescribed, stacked), independent
         except DependentRingError as error:
             ring = error.rows[: len(own)] if independent is None else independent.of_given(error.rows[: len(own)])
-        independent = IndependentEquations(self._unknowns, given, left, ring, firm)
+        independent = self._independent(given, left, ring, firm)
         return Restriction(self._unknowns, joined(independent.equations, rigid, g), free, prescribed), independent
+
+    def _independent(self, given: UnitingEquations, free: Bools, ring: Bools | None, firm: Bools) -> IndependentEquations:
+        from uem_dolfinx.algebra.dependent import IndependentEquations
+
+        return IndependentEquations(self._unknowns, given, free, ring, firm)
 
 
 @dataclass(frozen=True)
