@@ -68,7 +68,7 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     found, *_ = np.linalg.lstsq(rows.T, F, rcond=None)
     assert np.linalg.norm(rows.T @ found - F) <= 1e-10 * np.linalg.norm(F)
     largest, lam, tau = state.lam.max(), np.zeros_like(state.lam), np.zeros_like(state.force)
-    lam[who[normal]] = found[normal] * (share * placed.cone)[who[normal]]
+    lam[who[normal]] = found[normal] * placed.pressure_map(False).force[who[normal]]
     np.add.at(tau, who[~normal], found[~normal, None] * made.rows.select(kept).direction[~normal])
     assert np.abs(lam - state.lam).max() <= 1e-7 * largest
     assert np.abs(tau * share[:, None] - state.friction.tau)[stick].max() <= 1e-7 * largest

@@ -310,7 +310,7 @@ class Sliding:
             of_friction=self.active(state),
             stick=_of(state).stick,
             directions=self.directions(state),
-            slope=self._cone(state)[1] * kinematics.cone,
+            slope=self._cone(state)[1] * kinematics.pressure_map(False).force / kinematics.force_per_multiplier,
             normal=kinematics.normal,
             pointwise=self.discretisation.pointwise,
             keeps_ties=self.keeps_feet or self.discretisation.at_feet,

@@ -132,12 +132,6 @@ class MortarKinematics(PlacedOnTarget):
         assert self.rows.push is not None
         return np.asarray(self.rows.share / self.rows.push)
 
-    @property
-    def cone(self) -> Array:
-        """For equations divided by the lengths of their derivatives."""
-        assert self.rows.push is not None
-        return np.asarray(self.rows.push / self.rows.length)
-
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
     def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:

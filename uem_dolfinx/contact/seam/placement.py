@@ -268,10 +268,6 @@ class Kinematics(Protocol):
     def force_per_multiplier(self) -> Array:
         """Friction ``tau`` over the multipliers of tangential equations ``(n,)`` (first time: collective)."""
 
-    @property
-    def cone(self) -> Array:
-        """``lam`` over ``force_per_multiplier`` times the multiplier of the normal equation ``(n,)`` (first time: collective)."""
-
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
     def placed_again(self, state: PairState) -> Kinematics:
