@@ -25,6 +25,9 @@ from uem_dolfinx.contact.seam.state import FrictionState
 #: A tangential direction of which prescribed components leave less than this part is prescribed.
 #: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
 PRESCRIBED = 1e-6
+#: Slip with a smaller part along free components is along prescribed ones.
+#: [convention; a unit vector; test_led_to_and_fro.py::test_which_contactors_are_led]
+ALONG_CONDITIONS = 0.5
 #: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 1 on directions of slip go in circles.
 #: [heuristic; the diagonal of K; test_friction_moving_targets.py::test_a_slender_block_on_a_turntable]
 SLIP_STIFFNESS = 0.2
@@ -191,6 +194,22 @@ def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
     i = which & (size > 0)
     direction = np.where(i[:, None], q / np.where(i, size, 1.0)[:, None], state.direction)
     return replace(state, direction=direction, stick=state.stick & ~i)
+
+
+def led_before(direction: Array, free: Array, away: Array, rounding: float) -> Bools:
+    """Contactors that have not moved in this step, and slipped along prescribed components in the last one ``(n,)``.
+
+    They are taken to go on: otherwise their friction would begin along free components, where the last step has left none, and a body
+    that is led by all of its contactors would slide across their way.
+
+    Args:
+        direction: of slip, zero for contactors that do not slip ``(n, gdim)``.
+        free: tangential directions without prescribed components ``(n, gdim - 1, gdim)``.
+        away: relative motion in this step ``(n, gdim)``.
+        rounding: a length; shorter motions are none.
+    """
+    part = np.linalg.norm(along(free, direction), axis=1)
+    return (np.linalg.norm(away, axis=1) <= rounding) & direction.any(axis=1) & (part < ALONG_CONDITIONS)
 
 
 def slip_stiffness(own: Array, row: Ints, weight: Array, followed: Array) -> Array:
