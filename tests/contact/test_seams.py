@@ -312,8 +312,8 @@ def united(rows):
     node = np.array([node for one in mine for node, _ in one], dtype=np.int64)
     c = np.array([c for one in mine for _, c in one], dtype=float).reshape(-1, 2)
     seams = Seams([GivenRows(value, row, node, c)])
-    asked = np.array([2, 5, 7]) - config.first
-    known, group = seams.groups(config, asked[(asked >= 0) & (asked < config.n_owned)])
+    nodes = np.array([2, 5, 7]) - config.first
+    known, group = seams.groups(config, nodes[(nodes >= 0) & (nodes < config.n_owned)])
     others = COMM.allreduce(sum(len(np.unique(row)) for row, _ in seams.others(known, group)))
     return {frozenset(known[group == k].tolist()) for k in np.unique(group)}, others
 
@@ -324,7 +324,7 @@ def united(rows):
         ([], [], 0),
         ([tie(3, 7, X), tie(7, 3, Y)], [{3, 7}], 0),
         ([tie(3, 7, X), tie(3, 7, Y), tie(7, 2, X), tie(7, 2, Y), tie(0, 1, X), tie(0, 1, Y)], [{2, 3, 7}], 2),
-        # a group that goes on in nodes that are not asked about
+        # a group that goes on in other nodes
         (sum(([tie(a, b, X), tie(a, b, Y)] for a, b in ((2, 0), (3, 1), (1, 4), (4, 7), (0, 3))), []), [{0, 1, 2, 3, 4, 7}], 0),
         # a component alone, a rotation, the opposite, a multiple, a mean
         ([tie(3, 7, X)], [], 1),

@@ -347,8 +347,7 @@ def _shares(given: Array, independent: Array, firm: Bools) -> Array:
     if firm.any() and not firm.all():
         across = qr(given[firm].T, mode="full", check_finite=False)[0][:, firm.sum() :]
         shares[~firm] = _least(given[~firm] @ across, independent @ across)
-        independent = independent - shares[~firm].T @ given[~firm]
-        shares[firm] = _least(given[firm], independent)
+        shares[firm] = _least(given[firm], independent - shares[~firm].T @ given[~firm])
         return shares
     return _least(given, independent)
 

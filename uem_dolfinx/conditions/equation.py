@@ -75,6 +75,11 @@ class LinearEquations(Protocol):
         """Number of different right-hand sides."""
 
 
+def rows_of(config: Configuration, equations: Sequence[LinearEquations]) -> list[GivenRows]:
+    """This rank's rows of declared equations, one list for each (collective)."""
+    return [one.rows(config, f"equations[{i}]") for i, one in enumerate(equations)]
+
+
 class Equation(given.Sealed):
     """A linear equation between displacements of nodes: ``sum_k inner(c_k, u(place_k)) = b``.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.conditions.equation import GivenRows
+from uem_dolfinx.conditions.equation import GivenRows, rows_of
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
@@ -51,11 +51,9 @@ class Seams:
             here, before = np.sign(here + reached), marked
         every = np.unique(np.concatenate(space.comm.allgather(self._alike[some])), axis=0)
         pairs, count = np.unique(every[:, :2], axis=0, return_counts=True)
-        pairs = pairs[count == space.block]
-        node, at = np.unique(pairs, return_inverse=True)
-        start, end = at.reshape(pairs.shape).T
-        n = len(node)
-        graph = coo_matrix((np.ones(len(start)), (start, end)), (n, n))
+        node, at = np.unique(pairs[count == space.block], return_inverse=True)
+        start, end = at.reshape(-1, 2).T
+        graph = coo_matrix((np.ones(len(start)), (start, end)), (len(node), len(node)))
         return node, connected_components(graph, directed=False)[1].astype(int)
 
     def others(self, known: Ints, group: Ints) -> list[tuple[Ints, Ints]]:
@@ -75,7 +73,7 @@ def _others(row: Ints, group: Ints, highest: int, node: Ints) -> tuple[Ints, Int
 def seams_of(config: Configuration) -> Seams | None:
     """The equations of users with a configuration, or None without any (first time: collective)."""
     if config.seams is None and config.equations:
-        config.seams = Seams([one.rows(config, f"equations[{i}]") for i, one in enumerate(config.equations)])
+        config.seams = Seams(rows_of(config, config.equations))
     return config.seams
 
 

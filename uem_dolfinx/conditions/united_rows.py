@@ -13,7 +13,7 @@ from dolfinx import fem
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.conditions.equation import GivenRows, LinearEquations, values_of
+from uem_dolfinx.conditions.equation import GivenRows, LinearEquations, rows_of, values_of
 from uem_dolfinx.conditions.independent_rows import Solved, divided, eliminated, singles, sizes
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -81,9 +81,7 @@ class UnitedRows:
     def _make(self, first: Ints, free: Bools, contactors: Bools) -> None:
         """Choose the component that each equation eliminates (collective)."""
         config = self._config
-        parts = (
-            config.seams.given if config.seams else [one.rows(config, f"equations[{i}]") for i, one in enumerate(self._declared)]
-        )
+        parts = config.seams.given if config.seams else rows_of(config, self._declared)
         item = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
         rows = GivenRows.join([replace(p, value=p.value + f) for p, f in zip(parts, first)])
         size = sizes(config, rows, free)

@@ -295,7 +295,7 @@ class Sliding:
         # prescribed components at rest carry no friction; if all are prescribed, only the moving ones do
         told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
         least = GAP_ROUNDING * self.config.size
-        goes = (frame.forced(frame.away, self._lost) > least) | stick_slip.led_before(_of(state).direction, T, frame.away, least)
+        goes = (frame.forced(frame.away, self._lost) > least) | stick_slip.continues(_of(state).direction, T, frame.away, least)
         tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
         q = c[:, None] * frame.slip - tau
         self.pivot = Pivot.begin(self.front(self.config.comm), c, q, tau)

@@ -26,7 +26,7 @@ from uem_dolfinx.contact.seam.state import FrictionState
 #: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
 PRESCRIBED = 1e-6
 #: Slip with a smaller part along free components is along prescribed ones.
-#: [convention; a unit vector; test_led_to_and_fro.py::test_which_contactors_are_led]
+#: [convention; a unit vector; test_prescribed_to_and_fro.py::test_slip_along_conditions_goes_on]
 ALONG_CONDITIONS = 0.5
 #: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 1 on directions of slip go in circles.
 #: [heuristic; the diagonal of K; test_friction_moving_targets.py::test_a_slender_block_on_a_turntable]
@@ -196,11 +196,11 @@ def turned(state: FrictionState, which: Bools, q: Array) -> FrictionState:
     return replace(state, direction=direction, stick=state.stick & ~i)
 
 
-def led_before(direction: Array, free: Array, away: Array, rounding: float) -> Bools:
-    """Contactors that have not moved in this step, and slipped along prescribed components in the last one ``(n,)``.
+def continues(direction: Array, free: Array, away: Array, rounding: float) -> Bools:
+    """Contactors that have not moved in this step, and whose slip in the last one was along prescribed components ``(n,)``.
 
-    They are taken to go on: otherwise their friction would begin along free components, where the last step has left none, and a body
-    that is led by all of its contactors would slide across their way.
+    Their slip is assumed to continue. Otherwise their friction would begin along free components, where only rounding is left of it,
+    and a body all of whose contactors have prescribed motions would slide across them.
 
     Args:
         direction: of slip, zero for contactors that do not slip ``(n, gdim)``.

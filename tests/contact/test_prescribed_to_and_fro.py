@@ -1,4 +1,4 @@
-"""Blocks whose contactors are led to and fro over a rough plane, and which friction alone holds across their way."""
+"""Blocks whose contactors have prescribed motions to and fro over a rough plane; friction alone holds them across these motions."""
 
 from mpi4py import MPI
 
@@ -9,19 +9,19 @@ from dolfinx import fem
 from helpers import at, box, scene, slow
 
 import uem_dolfinx as uem
-from uem_dolfinx.contact.friction.stick_slip import led_before
+from uem_dolfinx.contact.friction.stick_slip import continues
 
 MU, PRESSURE, WAY = 0.2, 100.0, 0.3
 
 
-def test_which_contactors_are_led():
+def test_slip_along_conditions_goes_on():
     """Slip along a prescribed component goes on, slip across it or without a direction does not, nor that of those that have moved."""
     free = np.zeros((6, 2, 3))
     free[:, 0, 0] = 1.0
     direction = np.array([[0.0, 1.0, 0.0], [0.4, 0.9, 0.0], [0.7, 0.7, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     away = np.zeros((6, 3))
     away[5] = 1e-3
-    assert led_before(direction, free, away, 1e-9).tolist() == [True, True, False, False, False, False]
+    assert continues(direction, free, away, 1e-9).tolist() == [True, True, False, False, False, False]
 
 
 @pytest.mark.parametrize(
