@@ -13,6 +13,7 @@ from helpers import st_venant
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra import kept_factor
+from uem_dolfinx.algebra.condensed import Condensed
 from uem_dolfinx.algebra.kept_factor import KeptFactor
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 
@@ -37,6 +38,21 @@ def test_one_factorisation_serves_all_iterations(dim, monkeypatch):
     assert np.abs(u - v).max() <= 1e-8 * np.abs(v).max()
     assert np.array_equal(s.gather(contact.active), t.gather(other.active))
     assert np.abs(contact.resultant().force - other.resultant().force).max() <= 1e-7 * np.abs(other.resultant().force).max()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_linear_bodies_with_a_large_contact_zone(dim, monkeypatch):
+    """Where their condensation onto the contact would cost more than a factorisation, one factorisation serves a step as well."""
+    s, contact, problem = pressed(way=0.005, dim=dim)
+    problem.solve()
+    monkeypatch.setattr(Condensed, "_is_cheaper", lambda *_: False)
+    made, set_up = [], UnitedSolver._set_up
+    monkeypatch.setattr(UnitedSolver, "_set_up", lambda self, **options: made.append(set_up(self, **options)))
+    t, other, again = pressed(way=0.005, dim=dim)
+    assert len(again.solve()) > 3 and len(made) == 1
+    u, v = s.gather(problem.u), t.gather(again.u)
+    assert np.abs(u - v).max() <= 1e-8 * np.abs(v).max()
+    assert np.array_equal(s.gather(contact.active), t.gather(other.active))
 
 
 def test_every_step_factorises_once():

@@ -13,7 +13,6 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra import options
 from uem_dolfinx.algebra.deflation import near_null_space
 from uem_dolfinx.algebra.entries import is_symmetric
-from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import has_hypre, has_mumps
 from uem_dolfinx.geometry.configuration import Configuration
@@ -163,21 +162,3 @@ def test_an_unsymmetric_solve_leaves_as_much_as_it_was_asked_to(comm):
     dq, _ = solver.solve(rhs, accuracy=1e-6)
     assert solver.ksp.getType() == "gmres"
     assert (K * dq - rhs).norm() <= 1e-6 * rhs.norm()
-
-
-@pytest.mark.parametrize(
-    "changes, slower, kept", [(0, 1.0, True), (3, 1.0, True), (30, 1.0, False), (0, 2 / 3, True), (0, 6.0, False)]
-)
-def test_preconditioner_is_kept(changes, slower, kept):
-    """While few of a hundred equations have changed and it takes not many more iterations than at first."""
-    active = np.ones(100, bool)
-    made, now = (
-        UnitingEquations.along(
-            np.arange(100, dtype=np.int32), np.ones((100, 2)), np.zeros((100, 0), np.int64), np.zeros((100, 0)), np.zeros(100), a
-        )
-        for a in (active, active & (np.arange(100) >= changes))
-    )
-    solver = UnitedSolver(triangles(1), "thresholds_", ITERATIVE)
-    solver._made_with, solver._first_pace, solver._pace = made, 1.0, slower
-    solver._keep_preconditioner(now, *solver._changes(now))
-    assert solver._new != kept

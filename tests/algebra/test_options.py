@@ -42,3 +42,22 @@ def test_no_options_are_the_default_ones():
         assert options_in_turn({}, "empty_", 40_000, 3, False) == [{}, {}, {}]
     finally:
         del PETSc.Options()["empty_ksp_type"]
+
+
+@pytest.mark.skipif(not options.has_mumps(), reason="needs MUMPS")
+@pytest.mark.parametrize("kind", ["lu", "cholesky"])
+def test_a_factorisation_without_a_package_is_made_by_mumps(kind, caplog):
+    """Said once, and not where a package is named, here or in PETSc's database, or where it is no factorisation."""
+    package, asked = "pc_factor_mat_solver_type", {"ksp_type": "preonly", "pc_type": kind}
+    with caplog.at_level("INFO"):
+        assert options_in_turn(asked, "package_", 100, 3, False)[0] == asked | {package: "mumps"}
+    assert "MUMPS" in caplog.text
+    caplog.clear()
+    own = asked | {package: "petsc"}
+    assert options_in_turn(own, "package_", 100, 3, False)[0] == own
+    PETSc.Options()[f"package_{package}"] = "petsc"
+    try:
+        assert options_in_turn(asked, "package_", 100, 3, False)[0] == asked
+    finally:
+        del PETSc.Options()[f"package_{package}"]
+    assert package not in options_in_turn({"pc_type": "gamg"}, "package_", 100, 3, False)[0] and not caplog.text

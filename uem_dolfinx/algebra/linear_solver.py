@@ -14,8 +14,8 @@ from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.condensed import Condensed
 from uem_dolfinx.algebra.deflation import MULTIGRID, in_deflation, near_null_space, pressed_hard
 from uem_dolfinx.algebra.entries import is_symmetric, rows_are_symmetric, stiffen
-from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.kept_factor import KeptFactor
+from uem_dolfinx.algebra.kept_preconditioner import KeptPreconditioner
 from uem_dolfinx.algebra.options import GMRES_RESTART, NO_SUCH_TYPE, check_options, last_words, options_in_turn, tell_unused
 from uem_dolfinx.algebra.products import UnitedMatrix, made_of
 from uem_dolfinx.algebra.restriction import Restriction
@@ -27,12 +27,6 @@ from uem_dolfinx.parallel import agreed, reduced
 #: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
 #: [convention; ratio of norms; test_linear_solver.py::test_accuracy_of_an_iterative_solve]
 MOST_ACCURATE = 1e-10
-#: A preconditioner is kept for matrices that differ from its own in no more than this part of the equations.
-#: [convention; part of the equations; test_linear_solver.py::test_preconditioner_is_kept]
-KEPT_CHANGES = 0.1
-#: A preconditioner is kept while it takes no more than this times as many iterations for each digit as at first.
-#: [convention; ratio of iterations; test_linear_solver.py::test_preconditioner_is_kept]
-KEPT_SLOWER = 2.0
 #: Replacements for types of KSP and PC that need symmetric matrices.
 UNSYMMETRIC = {"cg": "gmres", "minres": "gmres", "cholesky": "lu", "icc": "ilu"}
 
@@ -71,10 +65,10 @@ class UnitedSolver:
         self._of: tuple[PETSc.Mat, int] | None = None
         #: Fingerprint of the matrices that the last constrained matrix was made of.
         self._made_of: Any = None
+        #: Arguments of the present constrained matrix.
+        self._asked: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
         #: P and K of the present constrained matrix, if it is symmetric and factorised.
         self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
-        #: Iterations per digit with a new preconditioner, and now.
-        self._first_pace = self._pace = 0.0
         #: Whether Q is not P, and whether a step begins.
         self._petrov_galerkin = self._begins = False
 
@@ -99,9 +93,8 @@ class UnitedSolver:
         self.options = options
         if self.ksp is not None:
             self.ksp.destroy()
-        #: Whether the preconditioner has to be set up for the present matrix; equations that it was made with.
-        self._new = True
-        self._made_with: UnitingEquations | None = None
+        #: Whether the preconditioner has to be set up for the present matrix; what it was made for.
+        self._new, self._preconditioner = True, KeptPreconditioner()
         self.ksp = self._create_ksp()
         #: Whether the KSP is for symmetric matrices, and the types of KSP and PC in the options.
         self._symmetric = True
@@ -164,7 +157,7 @@ class UnitedSolver:
         if same and not (self._begins and otherwise):
             self._begins, self._of = False, (K, K.stateGet())
             return
-        self._petrov_galerkin = test is not restriction
+        self._petrov_galerkin, self._asked = test is not restriction, (restriction, K, G, test)
         if self._begins and self.options is not self._first:
             self._use(self._first)
         self._begins = False
@@ -199,13 +192,14 @@ class UnitedSolver:
         else:
             self._A = self._united.update(restriction, restriction, K, G)
         pressed = pressed_hard(self.space, self._A, K, restriction) if self._deflates else np.zeros(0, dtype=bool)
-        here = [not rows_are_symmetric(self._A, self.space), pressed.any(), *self._changes(restriction.equations)]
+        here = [not rows_are_symmetric(self._A, self.space), pressed.any(), *self._preconditioner.changes(restriction.equations)]
         unsymmetric, hard, *changes = reduced(self.space.comm, np.array(here, dtype=np.int64))
         if unsymmetric and self._instead and self.iterative:
             self._use(self._instead)
         symmetric = not unsymmetric
         self._adapt(symmetric)
-        self._keep_preconditioner(restriction.equations, *changes)
+        self._new = not (self._preconditioner.serves(restriction.equations, *changes) and self.iterative)
+        self.pc.setReusePreconditioner(not self._new)
         self._A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if self._new and self.needs_near_null_space:
             self._A.setBlockSize(self.space.block)
@@ -235,11 +229,13 @@ class UnitedSolver:
         pays = not (self.iterative or self.space.mixed) and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
         pays = pays and (self.lasting or self._petrov_galerkin or again)
         serves = pays and self.condensed.serves(P, Q, K, G)
-        if not (serves or self.lasting or self._petrov_galerkin) and self._kept.serves(P, K):
-            self._served = P, K, G
-            return False
-        if not serves and not (pays and self._factorise_inside(P, Q, K, G)):
-            return False
+        first = self.lasting or self._petrov_galerkin
+        if not serves and not (first and pays and self._factorise_inside(P, Q, K, G)):
+            if not self._petrov_galerkin and self._kept.serves(P, K):
+                self._served = P, K, G
+                return False
+            if first or not (pays and self._factorise_inside(P, Q, K, G)):
+                return False
         if not (serves and same):
             self.condensed.unite(P, Q, G)
         return True
@@ -293,23 +289,6 @@ class UnitedSolver:
             self._new, self._A = True, A
             self.pc.setReusePreconditioner(False)
         self.ksp.setOperators(A, self._A)
-
-    def _changes(self, equations: UnitingEquations) -> tuple[int, int]:
-        """Number of owned equations activated or released since the preconditioner was made, and number active at that time."""
-        if not self.iterative or (before := self._made_with) is None:
-            return 0, 0
-        same = np.array_equal(equations.node, before.node)
-        changed = (equations.active != before.active).sum() if same else len(before) + 1
-        return int(changed), int(before.active.sum())
-
-    def _keep_preconditioner(self, equations: UnitingEquations, changed: int, present: int) -> None:
-        """Decide whether to reuse the preconditioner for the present matrix, from ``_changes`` summed over all ranks."""
-        known = self.iterative and self._made_with is not None
-        keep = known and changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
-        if not keep:
-            self._made_with, self._first_pace = equations, 0.0
-        self._new = not keep
-        self.pc.setReusePreconditioner(bool(keep))
 
     @property
     def tells_sign(self) -> bool:
@@ -395,7 +374,7 @@ class UnitedSolver:
                 with timed("factorisation or preconditioner set-up"):
                     self._set_up(**(mumps.TELLS_SIGN if self.tells_sign else {}))
             with timed("linear solve"), self._in_database():
-                self.ksp.solve(rhs, dq)
+                slow = self._iterate(rhs, dq)
         except PETSc.Error as error:
             if error.ierr in NO_SUCH_TYPE:
                 raise InputError(
@@ -407,6 +386,14 @@ class UnitedSolver:
             ) from error
         self._tell_unused()
         reason, iterations = self.ksp.getConvergedReason(), int(self.ksp.getIterationNumber())
+        if slow:
+            logger.debug("the preconditioner is made anew after %d iterations with an earlier one", iterations)
+            self._made_of = None
+            self._use(self.options)
+            assert self._asked is not None
+            self.set_operator(*self._asked)
+            dq, more = self.solve(rhs, accuracy, near)
+            return dq, iterations + more
         if reason < 0 and self._at_need and self.iterative:
             logger.debug("%s left the system with reason %d after %d iterations: it is factorised", kinds, reason, iterations)
             self._A, symmetric = self.ksp.getOperators()[0], self._symmetric
@@ -420,7 +407,7 @@ class UnitedSolver:
                 f"the united solve with {kinds} failed, KSP reason {reason}, after {iterations} iterations{mumps.how_it_ended(self.pc)}: "
                 "a body may be free to move as a rigid body, the tangent may be indefinite (use a direct solver), or ksp_max_it too small"
             )
-        self._keep_pace(iterations)
+        self._preconditioner.see(iterations, self.ksp.getConvergenceHistory())
         if self._factor_of is not None:
             self._kept.keep(self.pc, *self._factor_of)
         return dq, iterations
@@ -437,12 +424,16 @@ class UnitedSolver:
         """All unknowns of the last solve; with nodes ``asked``, completed only if one of these is missing (collective)."""
         return self.condensed.complete(dq, asked) if self._on_condensed else dq
 
-    def _keep_pace(self, iterations: int) -> None:
-        """Record the number of iterations per digit."""
-        norms = self.ksp.getConvergenceHistory()
-        if iterations > 0 and len(norms) > iterations and norms[iterations] > 0:
-            self._pace = iterations / max(np.log10(norms[0] / norms[iterations]), np.finfo(float).eps)
-            self._first_pace = self._first_pace or self._pace
+    def _iterate(self, rhs: PETSc.Vec, dq: PETSc.Vec) -> bool:
+        """Solve by the KSP from ``dq``; whether an earlier preconditioner takes too many iterations for that (collective)."""
+        rtol, _, _, bound = self.ksp.getTolerances()
+        most = self._preconditioner.most(rtol) if self.iterative else None
+        kept = most is not None and most < bound
+        if kept:
+            self.ksp.setTolerances(max_it=most)
+        self.ksp.solve(rhs, dq)
+        self.ksp.setTolerances(max_it=bound)
+        return kept and self.ksp.getConvergedReason() < 0
 
     def _tell_unused(self) -> None:
         """Warn, once, of options that PETSc has not used."""
