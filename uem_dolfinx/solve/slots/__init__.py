@@ -1,0 +1,1 @@
+"""The linearised frictional problem in relative motions, as a problem of arrays."""
