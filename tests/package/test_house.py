@@ -26,7 +26,7 @@ FLOORS = {
     "uem_dolfinx.contact": [
         "laws", "seam", "nodes", "mortar", "friction", "ties", "thermal", "pair", "offsets", "results", "warnings", "", "general",
     ],
-    "uem_dolfinx.solve": ["slots", "bodies", "rigid", "united", "", "steps"],
+    "uem_dolfinx.solve": ["bodies", "rigid", "slots", "united", "", "steps"],
 }  # fmt: skip
 LONGEST = 450
 #: Names of modules whose versions differ.
@@ -115,8 +115,8 @@ def test_imports_point_one_way():
 
 #: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
 BUDGETS = {
-    "members of the seam": 40, "members of Interface": 94, "heuristics": 14, "arrows within contact": 64, "arrows within solve": 36,
-    "lines of the package": 45578,
+    "members of the seam": 40, "members of Interface": 94, "heuristics": 14, "arrows within contact": 64, "arrows within solve": 38,
+    "lines of the package": 45980,
 }  # fmt: skip
 
 

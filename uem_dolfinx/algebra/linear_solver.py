@@ -135,6 +135,11 @@ class UnitedSolver:
         return bool(self.ksp.getType() != "preonly")
 
     @property
+    def cheap(self) -> bool:
+        """Whether solves for another active set need no factorisation."""
+        return self.iterative or self._on_condensed or self._served is not None
+
+    @property
     def needs_near_null_space(self) -> bool:
         """Whether the preconditioner can use the rigid-body modes."""
         return self.pc.getType() in ("gamg", "ml", "bddc") and not self.space.mixed

@@ -83,6 +83,11 @@ def _petsc() -> Any:
     return library
 
 
+def has_schur_complements() -> bool:
+    """Whether PETSc has MUMPS and its Schur complements."""
+    return bool(PETSc.Sys.hasExternalPackage("mumps")) and _petsc() is not None
+
+
 def condenses(pc: PETSc.PC) -> bool:
     """Whether a preconditioner is a factorisation by MUMPS that supports Schur complements."""
     return solves(pc) and _petsc() is not None

@@ -71,8 +71,8 @@ def default_options(size: int, gdim: int, mixed: bool = False) -> tuple[dict[str
 def options_in_turn(options: Mapping[str, Any] | None, prefix: str, size: int, gdim: int, mixed: bool) -> list[dict[str, Any]]:
     """PETSc options used first, options used if these fail or do not fit the matrix, and options used if they fail.
 
-    A factorisation without a package is made by MUMPS. Without ``options``, here or for this ``prefix`` in PETSc's database, these are ``default_options``, and, if they are iterative and
-    fail, MUMPS up to ``FACTORISED_UP_TO`` unknowns.
+    A factorisation without a package is made by MUMPS. Without ``options``, here or for this ``prefix`` in PETSc's database, these are
+    ``default_options``, and, if they are iterative and fail, MUMPS up to ``FACTORISED_UP_TO`` unknowns.
     """
     if options or (options is not None and PETSc.Options(prefix).getAll()):
         return [dict(options) | _factorised_by(options, prefix), {}, {}]

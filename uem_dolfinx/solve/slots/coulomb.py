@@ -14,7 +14,7 @@ contactors and slips of sticking ones vanish exactly.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,9 +32,9 @@ MOST_SOLVES_OF_A_START = 60
 #: A line search halves a step so often.
 #: [bound; halvings; -]
 LINE_HALVINGS = 7
-#: Rounds of fixed limits, and sweeps over all contactors.
+#: Rounds of fixed limits.
 #: [bound; rounds; -]
-MOST_SWEEPS = 40
+MOST_ROUNDS_OF_LIMITS = 40
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class _Newton:
     def fixed_limits(self, w: Array) -> Iterator[Array]:
         """Starts from which the limits of friction hardly change: solutions with fixed limits, those of the solution before."""
         limits = self.limits(self.forces(w))
-        for _ in range(MOST_SWEEPS):
+        for _ in range(MOST_ROUNDS_OF_LIMITS):
             found, done = self.run(w, limits)
             if not done:
                 return
@@ -227,34 +227,14 @@ class _Newton:
         p, lam = self.problem, force[self.problem.normal]
         return np.where(lam > 0, np.maximum(p.rest + p.slope * lam, 0.0), 0.0)
 
-    def sweeps(self) -> Iterator[Array]:
-        """Starts by block Gauss-Seidel: one contactor after the other moves, with the forces of all others fixed."""
-        p = self.problem
-        W, force = np.linalg.inv(p.stiffness), np.zeros_like(p.load)
-        w = W @ -p.load
-        own = [np.append(p.normal[i], p.tangents[i][self.there[i]]) for i in range(len(p.normal))]
-        for _ in range(MOST_SWEEPS):
-            for i, s in enumerate(own):
-                alone = replace(
-                    p, stiffness=np.linalg.inv(W[np.ix_(s, s)]), load=np.zeros(len(s)), normal=np.zeros(1, int),
-                    tangents=np.where(self.there[i], np.cumsum(self.there[i]), -1)[None],
-                    gap=p.gap[[i]], slip=p.slip[[i]], slope=p.slope[[i]], rest=p.rest[[i]],
-                )  # fmt: skip
-                alone = replace(alone, load=force[s] - alone.stiffness @ w[s])
-                found, done = _Newton(alone).run(w[s])
-                if done:
-                    w += W[:, s] @ (found.force - force[s])
-                    force[s] = found.force
-            yield w
-
 
 def solve(problem: SlotProblem) -> SlotState | None:
     """A state in which the conditions of contact and friction hold, or None if none has been found."""
     newton = _Newton(problem)
     found, done = newton.run(np.zeros_like(problem.load))
-    for starts in (newton.fixed_limits(found.w), newton.sweeps()):
-        while not done and (start := next(starts, None)) is not None:
-            found, done = newton.run(start)
+    starts = newton.fixed_limits(found.w)
+    while not done and (start := next(starts, None)) is not None:
+        found, done = newton.run(start)
     if not done:
         return None
     active, stick = found.closed, found.closed & found.stick

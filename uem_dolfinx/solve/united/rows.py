@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.algebra.dependent import IndependentEquations
     from uem_dolfinx.conditions.user_rows import RigidNodes, UserRows
     from uem_dolfinx.contact.thermal.heat import Heat, HeatEquations
+    from uem_dolfinx.solve.bodies.bodies import Bodies
 
 
 class OverConstraints:
@@ -158,6 +159,17 @@ class Rows:
     heat: dict[int, list[HeatEquations]]
     rigid: RigidNodes | None = None
 
+    @property
+    def conflict(self) -> bool:
+        """Whether some of the equations depend on others."""
+        return self.independent is not None and self.independent.found
+
+    def settle(self, bodies: Bodies, F: PETSc.Vec, G: PETSc.Mat | None) -> bool:
+        """Solve the linearised problem on arrays, with all conditions of contact, see ``slots.settle`` (collective)."""
+        from uem_dolfinx.solve.slots.settle import settle
+
+        return not self.conflict and settle(bodies, dict(zip(self.pairs, self.equations)), self.whole, self.test, F, G)
+
     def of(self, pairs: Sequence[Interface]) -> list[ContactRows]:
         """Equations of each of these pairs; empty for pairs without equations."""
         known = {id(pair): own for pair, own in zip(self.pairs, self.equations)}
@@ -182,7 +194,7 @@ class BodyState(IterationState):
             G: curvature of the contact, or None.
         """
         state, test, parts, first = self, self.test, [], 0
-        if test.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
+        if test.rings is not None or self.rows.conflict:
             return self
         for pair, own in zip(self.rows.pairs, self.rows.equations):
             parts += [heat.by_forces(own, test.lift[first : first + len(own)]) for heat in pair.heats if callable(heat.law.h)]

@@ -164,8 +164,8 @@ class BodySystem:
         self.floating.end_step()
         if self._not_unique is not None:
             state, negative = self._not_unique
-            added = together(self.curvature, state.added)
-            if negative != self.solver.negative_without(state.rows.frictionless, self.bodies.tangent.K, added):
+            matrix = state.rows.frictionless, self.bodies.tangent.K, together(self.curvature, state.added)
+            if negative != self.solver.negative_without(*matrix):
                 raise united_rows.several_answers()
 
     # -- equations and forces --------------------------------------------------------------------------------------------
@@ -260,7 +260,7 @@ class BodySystem:
     def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
         """P, terms of the slip directions in tangent and residual, number of active contactors, and their largest gap (collective)."""
         # if equations conflict, P might eliminate other components than Q
-        contested = self.over_constraints.shared or (rows.independent is not None and rows.independent.found)
+        contested = self.over_constraints.shared or rows.conflict
         apart = None if contested else rows.whole.moved
         self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
         trial = rows.frictionless
@@ -296,6 +296,9 @@ class BodySystem:
                 along = pair.stiffness_across(self.bodies.stiffness)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated[k] = pair.violated(gaps[k], forces[k], along, least, near, self._swept, moved)
+            costly = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap)
+            if costly and state.rows.settle(self.bodies, self.residual(), self.curvature):
+                return self._with_rows(state)
             if self._adrift:
                 chosen = violated if count(self.pairs, violated) else None
             else:
@@ -307,17 +310,15 @@ class BodySystem:
                 self._not_unique = (state, negative) if negative or either else None
                 self._take(forces)
                 return None
-            if self.exchanges.straight:
-                self.curvature = None
+            self.curvature = None if self.exchanges.straight else self.curvature
             if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen) if pair.asked]):
                 self.exchanges.start_again()
-            rows = self._rows()
-            # a released body has to fall first
-            self._adrift = self.floating.adrift
-            return self._with_rows(state, rows)
+            return self._with_rows(state)
 
-    def _with_rows(self, state: BodyState, rows: Rows) -> BodyState:
-        """The same bodies and residual with other rows (collective)."""
+    def _with_rows(self, state: BodyState) -> BodyState:
+        """The same bodies and residual with the rows of the pairs' present states (collective)."""
+        rows = self._rows()
+        self._adrift = self.floating.adrift  # a released body has to fall first
         trial, added, held, active, _ = self._trial_of(rows)
         return replace(state, trial=trial, test=rows.test, rows=rows, added=added, held=held, active=active, right=False)
 

@@ -1,0 +1,113 @@
+"""A linearised problem that is solved on arrays leaves the contacts the state that exchanges find, in one step of them.
+
+The test to read first: ``test_arrays_find_what_exchanges_find``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from driven_scenes import MORTAR, QUICK, SCENES, WAY
+from friction_scenes import driven
+from helpers import gathered_matrix, highest, slow, st_venant
+from ramp_scenes import COMM
+
+from uem_dolfinx.algebra.options import has_mumps
+from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.solve.slots import settle
+from uem_dolfinx.solve.united import exchanges
+from uem_dolfinx.solve.united.exchanges import AS_LONG, AS_LONG_IF_CHEAP, Exchanges
+from uem_dolfinx.solve.united.rows import Rows
+
+pytestmark = [pytest.mark.every_case, pytest.mark.skipif(not has_mumps(), reason="needs MUMPS")]
+
+
+def led(make):
+    """Lead a scene along ``WAY``: active contactors, exchanges, displacements and forces of the steps."""
+    problem, top = make()
+    found, g = [], problem.config.gdim
+    for place in WAY:
+        top.x.array[:] = np.tile([place[0], *[0.0] * (g - 2), place[1]], len(top.x.array) // g)
+        most = max(i.exchanges for i in problem.solve())
+        active, forces = sum(c.n_active for c in problem.contacts), sum(c.force.x.array for c in problem.contacts)
+        found.append((active, most, np.array(problem.u.x.array), np.array(forces)))
+    return found
+
+
+@pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in SCENES])
+def test_arrays_find_what_exchanges_find(name, monkeypatch):
+    """By every coupling and law: from the first violation on, and never; most problems then take one exchange."""
+    monkeypatch.setattr(exchanges, "AS_LONG", 10**6)
+    monkeypatch.setattr(exchanges, "AS_LONG_IF_CHEAP", 10**6)
+    by_exchanges = led(SCENES[name])
+    monkeypatch.setattr(exchanges, "AS_LONG", 0)
+    monkeypatch.setattr(exchanges, "AS_LONG_IF_CHEAP", 0)
+    made, own = [], Rows.settle
+    monkeypatch.setattr(Rows, "settle", lambda *given: made.append(own(*given)) or made[-1])
+    for one, other in zip(by_exchanges, led(SCENES[name])):
+        assert one[0] == other[0] and other[1] <= max(one[1], 2)
+        for a, b in zip(one[2:], other[2:]):
+            assert highest(COMM, np.abs(a - b)) <= 1e-6 * highest(COMM, np.abs(a))
+    assert sum(made) >= 0.5 * len(made)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "triangle", slow("hexahedron"), slow("tetrahedron")])
+@pytest.mark.parametrize("how", [{}, MORTAR], ids=str)
+def test_relative_coordinates(cell, how):
+    """T has the relative motions in its slots; condensed forces are the multipliers of given gaps and slips."""
+    n = (3, 5) if cell in ("triangle", "quadrilateral") else (2, 3)
+    scene = driven(cell, 0.3, law=st_venant, n=n, how=how)
+    scene.to(*[0.0] * (scene.problem.config.gdim - 1), -0.03)
+    problem, system = scene.problem, scene.problem.system
+    g = problem.config.gdim
+    rows = system._rows()
+    slots = settle._Slots.of(rows.pairs[0], rows.equations[0], 0)
+    problem.bodies.update_tangent()
+    condensed = settle._condensed(problem.bodies, rows.whole, rows.test, slots.rows, None)
+    K, T = gathered_matrix(problem.bodies.tangent.K), gathered_matrix(condensed.trial.T.P)
+    # others are held at their places, as those of corners
+    others = np.setdiff1d(np.flatnonzero(rows.whole.rows.active), slots.rows)
+    which = np.append(slots.rows, others)
+    B, back = (gathered_rows(problem.config, equations, which, g) for equations in (rows.whole.P, rows.whole.rows))
+    mine = np.concatenate(COMM.allgather(np.arange(len(which)) < len(slots.rows)))
+    place = np.concatenate(COMM.allgather(condensed.numbers(slots.rows)))
+    number = np.concatenate(COMM.allgather(condensed.trial.slot[slots.rows] + g * problem.config.first))
+    unit = np.zeros((len(number), len(T)))
+    unit[np.arange(len(number)), number] = 1.0
+    assert np.abs((B @ T)[mine] - unit).max() <= 1e-12
+    free = np.concatenate(COMM.allgather(rows.test.free.ravel()))
+    F = problem.bodies.residual.duplicate()
+    F.array[:] = np.random.default_rng(3 + COMM.rank).standard_normal(F.local_size)
+    load, whole = condensed.load(F), np.concatenate(COMM.allgather(F.array_r))
+    w = np.random.default_rng(0).standard_normal(len(number))
+    # du of free components and forces of the rows: K du - back' force = -F, B du = w
+    given = np.zeros(len(B))
+    given[mine] = w
+    A = np.block([[K[np.ix_(free, free)], -back[:, free].T], [B[:, free], np.zeros((len(B), len(B)))]])
+    force = np.linalg.solve(A, np.append(-whole[free], given))[free.sum() :][mine]
+    if COMM.rank == 0:
+        found = condensed.stiffness @ w[np.argsort(place)] + load
+        assert np.abs(found[place] - force).max() <= 1e-9 * np.abs(force).max()
+
+
+def gathered_rows(config, equations, which, g):
+    """Rows of all ranks as a dense matrix."""
+    B = np.zeros((len(equations), config.n_global, g))
+    B[np.arange(len(B)), equations.node + config.first] = equations.direction
+    np.subtract.at(B, (equations.row, equations.followed), equations.coefficients)
+    return np.concatenate(COMM.allgather(B[which].reshape(len(which), g * config.n_global)))
+
+
+@pytest.mark.parametrize("cheap, first", [(False, AS_LONG), (True, AS_LONG_IF_CHEAP)])
+def test_when_arrays_are_used(cheap, first, monkeypatch):
+    """Once in a problem, after two factorisations or ten solves without."""
+    scene = driven(mu=0.3, law=st_venant, n=(3, 5))
+    own = Exchanges(scene.problem.pairs)
+    wrong = [Violations(np.ones(n := len(pair.nodes), bool), np.zeros(n, bool), np.ones(n)) for pair in scene.problem.pairs]
+    none = [Violations.none(len(pair.nodes)) for pair in scene.problem.pairs]
+    taken = []
+    for number in range(15):
+        assert not own.take_long(none, cheap)
+        taken += [number] * own.take_long(wrong, cheap)
+        own._solve_again()
+    assert taken == [first] and (first < 4 or cheap) and 4 < AS_LONG_IF_CHEAP < 15

@@ -1,0 +1,191 @@
+"""Contact and friction of a linearised problem, solved on arrays: which contactors are open, stick and slip.
+
+The bodies are condensed onto the slots of all contactors near their targets. The state that is found there is given to the contacts; its
+rows, its increment and the check of all conditions follow as for any other state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx.algebra import mumps
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.options import FACTORISED_UP_TO
+from uem_dolfinx.algebra.relative import Condensation, RelativeCoordinates
+from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.algebra.rings import DependentRingError
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.laws.law import slides_otherwise
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam import active_set
+from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.contact.seam.placement import ContactRows
+from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.bodies.bodies import Bodies
+from uem_dolfinx.solve.bodies.tangent import known_forces
+from uem_dolfinx.solve.slots import coulomb
+
+#: A dense problem of so many slots takes 200 MB; beyond, one active set after the other is solved.
+#: [bound; slots; -]
+MOST_SLOTS = 5_000
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """Slots of the contactors of one pair.
+
+    Attributes:
+        pair: with its contactors.
+        contactor: those with slots ``(k,)``.
+        normal: number of the row along each one's normal, of all rows ``(k,)``.
+        tangents: numbers of the rows along the target, -1 for none ``(k, gdim - 1)``.
+        directions: of these rows, zero for none ``(k, gdim - 1, gdim)``.
+    """
+
+    pair: Interface
+    contactor: Ints
+    normal: Ints
+    tangents: Ints
+    directions: Array
+
+    @classmethod
+    def of(cls, pair: Interface, own: ContactRows, first: int) -> _Slots:
+        """Slots of contactors that may be in contact; the pair's rows begin with number ``first`` of all rows."""
+        place = np.full((len(pair.nodes), pair.config.gdim), -1, dtype=np.int64)
+        rows = np.flatnonzero((own.normal | (own.tangent >= 0)) & own.rows.direction.any(axis=1))
+        place[own.contactor[rows], own.tangent[rows] + 1] = rows
+        place[~pair.trial.active & (pair.off | ~pair.movable)] = -1
+        contactor = np.flatnonzero(place[:, 0] >= 0)
+        along = place[contactor, 1:]
+        there = along >= 0
+        directions = np.where(there[:, :, None], own.rows.direction[along], 0.0)
+        return cls(pair, contactor, first + place[contactor, 0], np.where(there, first + along, -1), directions)
+
+    @property
+    def rows(self) -> Ints:
+        """Numbers of all rows with slots."""
+        every = np.append(self.normal, self.tangents)
+        return every[every >= 0]
+
+    @property
+    def describable(self) -> bool:
+        """Whether two laws, of a gap and of a slip, describe all contactors of this rank."""
+        friction, cornered = self.pair.friction, bool(self.pair.trial.in_corner.any())
+        of_speed = friction is not None and slides_otherwise(friction.limits.law)
+        return not (cornered or self.pair.tie or self.pair.heats or of_speed)
+
+    def limits(self) -> tuple[Array, Array]:
+        """Slopes of the limits of friction by the normal multiplier, and limits at zero multiplier ``(k,)`` (collective)."""
+        pair, friction, i = self.pair, self.pair.friction, self.contactor
+        if friction is None:
+            return np.zeros(len(i)), np.zeros(len(i))
+        rest, slope = friction.limits.cone(pair.trial.lam, friction.slipping(pair.trial))
+        share = np.where(friction.value > 0, 1.0 / pair.kinematics.force_per_multiplier, 0.0)
+        return (slope * share * pair.kinematics.pressure_map(False).force)[i], (rest * share)[i]
+
+    def take(self, active: Bools, stick: Bools, direction: Array, slip: Array, force: Array) -> None:
+        """Set the state of the contactors ``(k,)``; slip directions, slips and friction are along the rows ``(k, gdim - 1)``."""
+        pair, i = self.pair, self.contactor
+        before, friction, now = pair.trial.active, pair.friction, pair.trial.active.copy()
+        now[i] = active
+        state = active_set.exchange(pair.trial, Violations(now & ~before, before & ~now, np.zeros(len(now))))
+        if friction is not None:
+            state = friction.come_and_go(state, before)
+            assert state.friction is not None
+            s, way, tau = np.zeros((3, len(now), pair.config.gdim))
+            for vectors, parts in ((s, direction), (way, slip), (tau, force)):
+                vectors[i] = np.einsum("kr,krg->kg", parts, self.directions)
+            sticks = np.zeros((2, len(now)), dtype=bool)
+            sticks[:, i] = active & (friction.value[i] > 0) & np.stack([stick, ~stick])
+            pivot, slides = friction.pivot, sticks[1][:, None]
+            c = pivot.stiffness[:, None]
+            q = np.where(slides, c * way - tau, pivot.q)
+            friction.pivot = replace(pivot, q=q, tau=np.where(slides, c * friction.frame.slip, pivot.tau))
+            chosen = np.zeros_like(now)
+            chosen[i] = True
+            f = state.friction
+            s = np.where(chosen[:, None], np.where(slides, s, 0.0), f.direction)
+            state = replace(state, friction=replace(f, stick=np.where(chosen, sticks[0], f.stick), direction=s))
+        pair.trial = state
+
+
+def settle(
+    bodies: Bodies,
+    equations: Mapping[Interface, ContactRows],
+    whole: ContactRows,
+    test: Restriction,
+    F: PETSc.Vec,
+    G: PETSc.Mat | None,
+) -> bool:
+    """Solve a linearised problem with all conditions of contact; whether the pairs have its state (collective).
+
+    Args:
+        bodies: with their tangent.
+        equations: rows of every pair that may be in contact.
+        whole: all rows.
+        test: Q of the present state.
+        F: forces of the bodies at the present displacement, minus friction that is independent of normal forces.
+        G: curvature of the contact, or None.
+    """
+    comm, space, slots, first = bodies.comm, test.space, [], 0
+    for pair, own in equations.items():
+        slots.append(_Slots.of(pair, own, first))
+        first += len(own)
+    few = space.block * space.n_global <= FACTORISED_UP_TO[space.gdim] and mumps.has_schur_complements() and not space.mixed
+    described = few and test.rings is None and first == len(whole) and all(one.describable for one in slots)
+    number, refused = reduced(comm, np.array([sum(len(one.rows) for one in slots), not described], dtype=np.int64))
+    if refused or not 0 < number <= MOST_SLOTS:
+        return False
+    condensed = _condensed(bodies, whole, test, np.concatenate([one.rows for one in slots]), G)
+    if condensed is None:
+        return False
+    for nodes, forces in known_forces(list(equations)):
+        F.array[: bodies.forces.size] += bodies.config.add_at_owners(nodes, forces).ravel()
+    load, gap = condensed.load(F), whole.P.gap
+    normal, tangents = (np.concatenate([getattr(one, name) for one in slots]) for name in ("normal", "tangents"))
+    limits = [np.concatenate(parts) for parts in zip(*(one.limits() for one in slots))]
+    slip = np.where(tangents >= 0, gap[tangents], 0.0)
+    arrays = [condensed.gathered(a) for a in (*map(condensed.numbers, (normal, tangents)), gap[normal], slip, *limits)]
+    found = coulomb.solve(coulomb.SlotProblem(condensed.stiffness, load, *arrays)) if comm.rank == 0 else None
+    condensed.destroy()
+    states = comm.bcast(None if found is None else _states(found, *arrays[1:4:2]))
+    if states is None:
+        return False
+    begins = sum(comm.allgather(len(normal))[: comm.rank])
+    ends = begins + np.cumsum([len(one.contactor) for one in slots])
+    for one, end in zip(slots, ends):
+        one.take(*(values[end - len(one.contactor) : end] for values in states))
+    return True
+
+
+def _condensed(bodies: Bodies, whole: ContactRows, test: Restriction, rows: Ints, G: PETSc.Mat | None) -> Condensation | None:
+    """The bodies condensed onto the slots of some ``rows``; None if these cannot be eliminated together (collective)."""
+    of_slots = np.zeros(len(whole), dtype=bool)
+    of_slots[rows] = True
+
+    def coordinates(equations: UnitingEquations) -> RelativeCoordinates:
+        every = replace(equations, active=equations.active | of_slots, gap=np.where(of_slots, 0.0, equations.gap))
+        return RelativeCoordinates(Restriction(test.space, every, test.free, bodies.prescribed), of_slots)
+
+    try:
+        trial = coordinates(whole.P)
+        back = trial if whole.moved is None else coordinates(whole.rows)
+    except (ConflictError, DependentRingError):
+        return None
+    if trial.T.rings is not None or back.T.rings is not None:
+        return None
+    condensed = Condensation(test.space, trial, back, bodies.tangent.K, G)
+    return None if reduced(bodies.comm, int(condensed.stiffness is None)) else condensed
+
+
+def _states(found: coulomb.SlotState, tangents: Ints, slip: Array) -> Sequence[Any]:
+    """Arguments of ``_Slots.take`` for all contactors."""
+    there = tangents >= 0
+    way, force = (np.where(there, values[tangents], 0.0) for values in (found.w, found.force))
+    return found.active, found.stick, found.direction, slip + way, force
