@@ -32,8 +32,8 @@ class PointLoad(given.Sealed):
             total force on the whole circle.
 
     Raises:
-        InputError, InputTypeError: for a force of another form, or, when the problem is made, a place without a node. When the problem
-            is made also a TagError for a tag that is not of points.
+        InputError, InputTypeError: for a force of another form. When the problem is made also for a place without a node, and a
+            TagError for a tag of other entities than points.
     """
 
     SETTABLE: ClassVar = {"force": None}
@@ -58,7 +58,7 @@ class PointLoad(given.Sealed):
 class PointSpring(given.Sealed):
     """A linear spring between a node, or each of several, and its reference position: the force on the node is ``-k u``.
 
-        uem.PointSpring(tags["foot"], 1e4)              # alike in all directions
+        uem.PointSpring(tags["foot"], 1e4)              # the same in all directions
         uem.PointSpring(tags["foot"], (0.0, 1e4))       # along y
 
     Args:
@@ -112,9 +112,8 @@ class AtPoints:
         with agreed(config.comm):
             for one, _ in self.parts:
                 one.force_and_stiffness(config.gdim)
-        n = len(config.whole.x.array)
         #: Unknowns of the components of the nodes ``(n_local, gdim)``.
-        self._unknowns = config.of(np.arange(n))
+        self._unknowns = config.of(np.arange(len(config.whole.x.array)))
 
     def add_forces(self, b: AnyArray) -> None:
         """Add forces of loads and springs to a residual, internal minus external forces, at the owned unknowns ``(n,)`` (collective)."""
@@ -136,12 +135,11 @@ class AtPoints:
 
     def energy(self) -> float:
         """Energy stored in the springs (collective)."""
-        u, parts = (
-            self._config.displacement,
-            [(nodes, one.force_and_stiffness(self._config.gdim)[1]) for one, nodes in self.parts],
-        )
-        own = sum(0.5 * float(np.einsum("ng,gh,nh->", u[nodes], k, u[nodes])) for nodes, k in parts if k is not None)
-        return float(reduced(self._config.comm, float(own)))
+        u, own = self._config.displacement, 0.0
+        for one, nodes in self.parts:
+            k = one.force_and_stiffness(self._config.gdim)[1]
+            own += 0.0 if k is None else 0.5 * float(np.einsum("ng,gh,nh->", u[nodes], k, u[nodes]))
+        return float(reduced(self._config.comm, own))
 
     def add_stiffness(self, K: PETSc.Mat) -> None:
         """Add the springs to an assembled tangent (collective)."""

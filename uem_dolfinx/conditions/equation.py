@@ -148,12 +148,7 @@ class Periodic(given.Sealed):
     firm = False
 
     def __init__(
-        self,
-        follower: Part,
-        leader: Part,
-        map: Callable[[Array], Array] | None,
-        turn: npt.ArrayLike | None,
-        jump: Value,
+        self, follower: Part, leader: Part, map: Callable[[Array], Array] | None, turn: npt.ArrayLike | None, jump: Value
     ):
         self._follower, self._leader = follower, leader
         self.places = [follower, leader]
@@ -178,8 +173,8 @@ class Periodic(given.Sealed):
         x = config.X[follower]
         images = self._images(config, x, middle_of(config, leader) - middle_of(config, follower), role)
         self._check_sizes(config, len(follower), len(leader), role)
-        there, distance, following = partners(config, images, leader)
-        error, bad, double = None, distance > NEAR * following, following <= COINCIDENT * config.size
+        there, distance, second = partners(config, images, leader)
+        error, bad, double = None, distance > NEAR * second, second <= COINCIDENT * config.size
         if double.any():
             error = SurfaceError(
                 f"{role}: the node at {config.describe(int(follower[np.argmax(double)]))} has several partners, as "

@@ -4,8 +4,8 @@ With the equations ``A u = b`` of all ranks and one component p of each, with co
 
     R = T A,    R u = T b,    R_p = 1
 
-Most equations have a component that no other one has; it is eliminated directly, and T only divides by its coefficient. Other equations,
-e.g. at the edges of cells that are periodic in several directions, are solved together by elimination, on every rank.
+Most equations have a component that no other equation has. It is eliminated directly: T divides by its coefficient. Other equations, e.g.
+at the edges of cells that are periodic in several directions, are solved together by elimination, on every rank.
 """
 
 from __future__ import annotations
@@ -78,15 +78,15 @@ def singles(config: Configuration, rows: GivenRows, size: Array, spared: Bools) 
     row = np.repeat(rows.row, g)
     for allowed in (~spared, np.ones_like(spared)):
         while True:
-            alone = (halo.take(counts.__getitem__) == 1.0) & allowed[:, None] & (chosen < 0)[rows.row, None]
-            value = np.where(alone, size, 0.0).ravel()
+            single = (halo.take(counts.__getitem__) == 1.0) & allowed[:, None] & (chosen < 0)[rows.row, None]
+            value = np.where(single, size, 0.0).ravel()
             order = np.lexsort((-value, row))
             first = order[np.unique(row[order], return_index=True)[1]]
             first = first[value[first] > 0.0]
             chosen[row[first]] = first
-            gone = np.zeros(len(rows), dtype=bool)
-            gone[row[first]] = True
-            terms = gone[rows.row]
+            done = np.zeros(len(rows), dtype=bool)
+            done[row[first]] = True
+            terms = done[rows.row]
             counts = counts - config.add_at_owners(rows.node[terms], counted[terms])
             if not reduced(config.comm, len(first)):
                 break
@@ -94,7 +94,7 @@ def singles(config: Configuration, rows: GivenRows, size: Array, spared: Bools) 
 
 
 def divided(rows: GivenRows, chosen: Ints) -> Solved:
-    """Rows that each eliminate a component which no other row has; of any node."""
+    """Rows that each eliminate a component that no other row has; their nodes may belong to any rank."""
     m, g = len(rows), rows.coefficients.shape[1]
     column = (rows.node[:, None] * g + np.arange(g)).ravel()
     scale = rows.coefficients.ravel()[chosen]

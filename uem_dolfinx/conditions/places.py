@@ -17,10 +17,10 @@ from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import as_tag, name_of
 from uem_dolfinx.parallel import gathered, reduced
 
-#: A node is where it is looked for if it is nearer than this part of the distance to the next one.
-#: [convention; distance to the next node; test_places.py::test_how_near_a_node_must_be]
+#: A node is at a position if it is nearer than this part of the distance of the second nearest node.
+#: [convention; distance of the second node; test_places.py::test_how_near_a_node_must_be]
 NEAR = 1e-3
-#: Places that differ by less are the same: no node can be told from another one there.
+#: Positions that differ by less are equal: nodes there cannot be distinguished.
 #: [bound; the model's size; -]
 COINCIDENT = 1e-9
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -74,18 +74,19 @@ class RigidCoupling(given.Sealed):
         self.point = given.vector("point", point)
         g = len(self.point)
         self._sizes = g, 1 if g == 2 else 3
-        self._loads = checked_value("force", force, g), checked_value("moment", moment, self._sizes[1])
+        loads = {"force": checked_value("force", force, g), "moment": checked_value("moment", moment, self._sizes[1])}
         self.distribute = given.flag("distribute", distribute)
         self._rotations = rotations if rotations is None else given.word("rotations", rotations, ("large", "small"))
         n, words = sum(self._sizes), "None where it is free and a value elsewhere"
         motion = [None] * n if motion is None else motion
-        given.kind(
-            "motion", motion, isinstance(motion, Sequence) and not isinstance(motion, str), f"a list of {n} items, {words}"
-        )
+        is_list = isinstance(motion, Sequence) and not isinstance(motion, str)
+        given.kind("motion", motion, is_list, f"a list of {n} items, {words}")
         if len(motion) != n:
             raise InputError(given.sentence("motion", motion, f"{n} items, {words}"))
         #: Values of the prescribed components by their number.
         self.prescribed = {i: checked_value(f"motion[{i}]", v, 1) for i, v in enumerate(motion) if v is not None}
+        #: Force, moment and prescribed motion as declared, by name.
+        self._declared: dict[str, Any] = loads | {f"motion[{i}]": v for i, v in self.prescribed.items()}
         if self.distribute and self.prescribed:
             raise InputError(
                 "motion of a RigidCoupling with distribute=True: the mean motion of a part that deforms cannot be prescribed; leave "
@@ -106,7 +107,7 @@ class RigidCoupling(given.Sealed):
         #: Force and moment of the prescribed motion, as last computed.
         self.reactions: tuple[Array, Array] = np.zeros(self._sizes[0]), np.zeros(self._sizes[1])
         self._set: RigidSet | None = None
-        self._asked: dict[Any, Any] = {}
+        self._evaluated: dict[str, Any] = {}
 
     # -- in a problem ------------------------------------------------------------------------------------------------------
 
@@ -143,29 +144,24 @@ class RigidCoupling(given.Sealed):
     def take_load(self, at: float) -> None:
         """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
         comm = self.nodes.config.comm
-        for key, value in (("force", self._loads[0]), ("moment", self._loads[1]), *self.prescribed.items()):
+        for name, value in self._declared.items():
             if callable(value) and not isinstance(value, fem.Constant):
-                what = (
-                    f"the {key if isinstance(key, str) else f'motion[{key}]'} of the RigidCoupling of '{self.name}' at {at:.6g}"
-                )
-                self._asked[key] = ask_together(comm, what, value, at)
+                words = f"the {name} of the RigidCoupling of '{self.name}' at {at:.6g}"
+                self._evaluated[name] = ask_together(comm, words, value, at)
 
     def given_values(self) -> dict[str, Any]:
         """Its present values by name; functions are replaced by their last values."""
-        loads: dict[Any, Any] = {"force": self._loads[0], "moment": self._loads[1], **self.prescribed}
-        now = {key if isinstance(key, str) else f"motion[{key}]": self._asked.get(key, v) for key, v in loads.items()}
-        return {"the point": self.point, "the mass": self.mass, "the inertia": self.inertia} | {
-            f"the {key}": v for key, v in now.items()
-        }
+        now = {f"the {name}": value for name, value in (self._declared | self._evaluated).items()}
+        return {"the point": self.point, "the mass": self.mass, "the inertia": self.inertia, **now}
+
+    def _values(self, name: str, size: int) -> Array:
+        """Present numbers ``(size,)`` of the force, the moment or a component of the motion."""
+        return values_of(f"{name} of the RigidCoupling of '{self.name}'", self._evaluated.get(name, self._declared[name]), size)
 
     def loads(self) -> tuple[Array, Array]:
         """Present force ``(gdim,)`` and moment ``(n_turns,)`` at the point (collective)."""
         with agreed(self.nodes.config.comm):
-            force, moment = (
-                values_of(f"the {key} of the RigidCoupling of '{self.name}'", self._asked.get(key, value), size)
-                for key, value, size in zip(("force", "moment"), self._loads, self._sizes)
-            )
-        return force, moment
+            return self._values("force", self._sizes[0]), self._values("moment", self._sizes[1])
 
     def nodal_forces(self) -> Array:
         """Nodal forces of ``loads`` at the owned nodes of the part ``(n, gdim)`` (collective)."""
@@ -175,21 +171,7 @@ class RigidCoupling(given.Sealed):
     def wanted(self) -> Array:
         """Present values of the prescribed components ``(k,)``, in the order of ``prescribed`` (collective)."""
         with agreed(self.nodes.config.comm):
-            found = [
-                values_of(f"motion[{i}] of the RigidCoupling of '{self.name}'", self._asked.get(i, v), 1)[0]
-                for i, v in self.prescribed.items()
-            ]
-        return np.array(found, dtype=float)
-
-    def ramped(self, loaded: Sequence[fem.Constant]) -> npt.NDArray[np.bool_]:
-        """Mask of prescribed components that are ramped with the Dirichlet values ``(k,)``; ``loaded`` Constants are not."""
-        return np.array(
-            [
-                not any(v is c for c in loaded) if isinstance(v, fem.Constant) else not callable(v)
-                for v in self.prescribed.values()
-            ],
-            dtype=bool,
-        )
+            return np.array([self._values(f"motion[{i}]", 1)[0] for i in self.prescribed], dtype=float)
 
     def motion_of(self, u: Array, near: Array | None = None) -> Array:
         """Displacement of the point and rotation ``(gdim + n_turns,)``, from a displacement ``(n_owned, gdim)`` (collective).
@@ -248,7 +230,7 @@ def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:
     """Inertia as a matrix ``(n_turns, n_turns)``.
 
     Raises:
-        InputError, InputTypeError: if no body can have it: principal moments must not be negative, nor exceed the sum of the others.
+        InputError, InputTypeError: if a principal moment is negative, or exceeds the sum of the others.
     """
     if np.ndim(value) == 0:
         return np.eye(n_turns) * given.number("inertia", value, given.NOT_NEGATIVE)
@@ -265,14 +247,8 @@ def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:
     found = 0.5 * (found + found.T)
     moments = np.linalg.eigvalsh(found)
     if moments[0] < -rounding or 0.5 * moments.sum() - moments[-1] < -rounding:
-        raise InputError(
-            given.sentence(
-                "inertia",
-                value,
-                f"principal moments {moments} that are not negative, and none more than the sum of the others",
-                "no body has such an inertia",
-            )
-        )
+        expected = f"principal moments {moments} that are not negative, and none more than the sum of the others"
+        raise InputError(given.sentence("inertia", value, expected, "no body has such an inertia"))
     return np.asarray(found)
 
 
@@ -286,8 +262,3 @@ def nearest_turn(turn: Array, known: Array) -> Array:
         return np.asarray(axis * 2.0 * np.pi * np.round(known @ axis / (2.0 * np.pi)))
     axis = turn / angle
     return np.asarray(axis * (angle + 2.0 * np.pi * np.round((known @ axis - angle) / (2.0 * np.pi))))
-
-
-def constants_of(load: Any) -> list[fem.Constant]:
-    """Constants that a problem's ``load`` sets."""
-    return list(load) if isinstance(load, Mapping) else [load] if isinstance(load, fem.Constant) else []

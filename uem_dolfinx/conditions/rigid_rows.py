@@ -25,16 +25,16 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.conditions.places import COINCIDENT, NEAR
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling, nearest_turn
 from uem_dolfinx.conditions.rigid_set import Placement, turned, velocities
-from uem_dolfinx.conditions.united_rows import CONTRADICTING
+from uem_dolfinx.conditions.united_rows import CONTRADICTING, is_ramped
 from uem_dolfinx.errors import ConflictError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.rigid import Motion, rotation_matrix
 from uem_dolfinx.parallel import agree, gathered, reduced
 
-#: Components of a set are chosen anew when they tell its motion worse than this part of what they did when they were chosen.
+#: Components of a set are chosen anew when the least singular value of their rows falls below this part of what it was.
 #: [convention; least singular value of their rows; test_rigid_coupling.py::test_when_components_are_chosen_anew]
-TOLD_WORSE = 0.5
+REDUCED = 0.5
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Basis:
         node: global nodes ``(k,)``.
         component: of each ``(k,)``.
         X: positions of the nodes in the reference configuration ``(k, gdim)``.
-        told: smallest singular value of their rows and the rows of the prescribed motion, when they were chosen.
+        least: smallest singular value of their rows and the rows of the prescribed motion, when they were chosen.
         halo: fetches values from the owners.
     """
 
     node: Ints
     component: Ints
     X: Array
-    told: float
+    least: float
     halo: Halo
 
     @cached_property
@@ -85,7 +85,7 @@ class RigidRows:
         #: Components with Dirichlet condition of all owned nodes ``(n_owned, gdim)``.
         self._held_nodes: Bools = ~free
         self._free, self._avoided = free[own], avoided[own]
-        self._ramped = coupling.ramped(loaded)
+        self._ramped = np.array([is_ramped(value, loaded) for value in coupling.prescribed.values()], dtype=bool)
         self._wanted = coupling.wanted()
         self._basis: Basis | None = None
         #: Displacement at the beginning of the ramp, and its rigid motion.
@@ -123,8 +123,8 @@ class RigidRows:
         if not self.set.large:
             return
         u, nodes = self._config.displacement[: self._config.n_owned], self.set.nodes
-        way = self.set.placement(u).displacement(self.set.X) - u[nodes]
-        self._config.shift(nodes, np.where(self._free, way, 0.0))
+        change = self.set.placement(u).displacement(self.set.X) - u[nodes]
+        self._config.shift(nodes, np.where(self._free, change, 0.0))
 
     def end_step(self) -> None:
         """Store the number of turns, and refuse Dirichlet values that no rigid motion satisfies (collective).
@@ -140,13 +140,13 @@ class RigidRows:
                 found[i] = value
         self.coupling.turns = found[shift:]
         size = float(reduced(config.comm, np.abs(config.displacement[: config.n_owned]).max(initial=0.0), op=MPI.MAX))
-        apart = np.where(~self._free & ~self._left, np.abs(eq.gap.reshape(-1, shift)), 0.0)
+        misfit = np.where(~self._free & ~self._left, np.abs(eq.gap.reshape(-1, shift)), 0.0)
         error = None
-        if (apart > CONTRADICTING * size).any():
-            worst = int(np.argmax(apart.max(axis=1)))
+        if (misfit > CONTRADICTING * size).any():
+            worst = int(np.argmax(misfit.max(axis=1)))
             error = ConflictError(
                 f"the RigidCoupling of '{self.coupling.name}' and a Dirichlet value at {config.describe(int(self.set.nodes[worst]))} "
-                f"differ by {apart.max():.4g}: no rigid motion has the prescribed values; give values that agree, or leave conditions out"
+                f"differ by {misfit.max():.4g}: no rigid motion has the prescribed values; give values that agree, or leave conditions out"
             )
         agree(config.comm, error)
 
@@ -157,7 +157,7 @@ class RigidRows:
         s, g, held = self.set, self._config.gdim, list(self.coupling.prescribed)
         n_turns = 1 if g == 2 else 3
         if not s.large:
-            at, turn = s.drawn, np.zeros(n_turns)
+            at, turn = s.reference, np.zeros(n_turns)
         else:
             at = s.placement(self._config.displacement[: self._config.n_owned])
             turn = nearest_turn(at.turn, self.coupling.turns)
@@ -179,28 +179,20 @@ class RigidRows:
         C = C * s.scale
         lengths = np.linalg.norm(C, axis=1)
         C, lacking = C / lengths[:, None], lacking / lengths
-        basis = self._told_by(at, C)
+        basis = self._basis_for(at, C)
         k, m = len(basis.node), len(s.nodes)
         inverse = np.linalg.inv(np.concatenate([self._rows_of(basis, at), C]))
         u = config.displacement[: config.n_owned]
-        off = basis.halo.take(u.__getitem__)[np.arange(k), basis.component]
-        off = off - at.displacement(basis.X)[np.arange(k), basis.component]
+        off = (basis.halo.take(u.__getitem__) - at.displacement(basis.X))[np.arange(k), basis.component]
         V = velocities(at.arms(s.X)) * self.set.scale
         gap = u[s.nodes] - at.displacement(s.X) - V @ (inverse @ np.append(off, lacking))
         nodes, which = basis.nodes
-        coefficients = np.zeros((m, g, len(nodes), g))
-        coefficients[:, :, which, basis.component] = V @ inverse[:, :k]
+        c = np.zeros((m, g, len(nodes), g))
+        c[:, :, which, basis.component] = V @ inverse[:, :k]
+        node, direction = np.repeat(s.nodes, g), np.tile(np.eye(g), (m, 1))
         row, followed = np.repeat(np.arange(m * g), len(nodes)), np.tile(nodes, m * g)
-        self._inverse, self._at = inverse, at
-        self.equations = UnitingEquations(
-            np.repeat(s.nodes, g),
-            np.tile(np.eye(g), (m, 1)),
-            gap.ravel(),
-            self.eliminated.ravel(),
-            row,
-            followed,
-            coefficients.reshape(-1, g),
-        )
+        self._inverse, self._at, active = inverse, at, self.eliminated.ravel()
+        self.equations = UnitingEquations(node, direction, gap.ravel(), active, row, followed, c.reshape(-1, g))
         return self.equations
 
     @property
@@ -229,15 +221,9 @@ class RigidRows:
         added = np.zeros((m, len(nodes), g))
         np.add.at(added.reshape(m, len(nodes) * g), (rows[:, None], which * g + basis.component), V)
         i, k = np.nonzero(np.abs(added).max(axis=2, initial=0.0) > NEGLIGIBLE)
+        gaps, row = eq.gap + np.bincount(rows, (taken * gap).sum(axis=1), m), np.concatenate([eq.row, i])
         followed, kept = np.concatenate([eq.followed, nodes[k]]), np.concatenate([terms[m:], added[i, k]])
-        return replace(
-            eq,
-            direction=-terms[:m],
-            gap=eq.gap + np.bincount(rows, (taken * gap).sum(axis=1), m),
-            row=np.concatenate([eq.row, i]),
-            followed=followed,
-            coefficients=kept,
-        )
+        return replace(eq, direction=-terms[:m], gap=gaps, row=row, followed=followed, coefficients=kept)
 
     def largest_gap_here(self) -> float:
         """Largest gap over the sum of the coefficients of its equation, a length, on this rank."""
@@ -252,7 +238,7 @@ class RigidRows:
         and reactions act.
 
         Returns:
-            Global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``, on one rank; None if there is none.
+            Global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``, on one rank; None without stiffness.
         """
         s, config, g, added = self.set, self._config, self._config.gdim, self.coupling.added
         if not s.large or self._basis is None or not len(self._basis.node):
@@ -317,7 +303,7 @@ class RigidRows:
         # masses scaled to the order of 1, like the rows
         size = np.trace(G)
         G = G / size
-        basis = self._told_by(at, C)
+        basis = self._basis_for(at, C)
         held = basis.halo.take(self._held_nodes.__getitem__)[np.arange(len(basis.node)), basis.component]
         rows = np.concatenate([C, self._rows_of(basis, at)[held]])
 
@@ -355,9 +341,13 @@ class RigidRows:
         """Rows B of the components q ``(k, n_z)``."""
         return (velocities(at.arms(basis.X)) * self.set.scale)[np.arange(len(basis.node)), basis.component]
 
-    def _told_by(self, at: Placement, C: Array) -> Basis:
+    def _least(self, basis: Basis, at: Placement, C: Array) -> float:
+        """Smallest singular value of the rows B and C."""
+        return float(np.linalg.svd(np.concatenate([self._rows_of(basis, at), C]), compute_uv=False)[-1])
+
+    def _basis_for(self, at: Placement, C: Array) -> Basis:
         """Components q that determine the motion together with C, unchanged as long as they are well conditioned (collective)."""
-        if self._basis is not None and _told(np.concatenate([self._rows_of(self._basis, at), C])) < TOLD_WORSE * self._basis.told:
+        if self._basis is not None and self._least(self._basis, at, C) < REDUCED * self._basis.least:
             self._basis = None
         if self._basis is None:
             self._basis = self._choose(at, C)
@@ -404,18 +394,13 @@ class RigidRows:
         table = np.array(chosen).reshape(-1, 2 * g + 2)
         node, component = table[:, g + 1].astype(np.int64), table[:, g].astype(np.int64)
         basis = Basis(node, component, table[:, g + 2 :], 0.0, Halo(config, node))
-        return replace(basis, told=_told(np.concatenate([self._rows_of(basis, at), C])))
+        return replace(basis, least=self._least(basis, at, C))
 
 
 def _without(rows: Array, row: Array) -> Array:
     """Rows ``(..., n)`` without their components along another row."""
     q = row / np.linalg.norm(row)
     return rows - (rows @ q)[..., None] * q
-
-
-def _told(rows: Array) -> float:
-    """Smallest singular value."""
-    return float(np.linalg.svd(rows, compute_uv=False)[-1])
 
 
 def turn_rates(turn: Array) -> Array:

@@ -101,7 +101,7 @@ class RigidSet:
         return np.asarray(reduced(self.config.comm, values.sum(axis=0))) / max(self.count, 1)
 
     @property
-    def drawn(self) -> Placement:
+    def reference(self) -> Placement:
         """Its placement in the reference configuration."""
         g = self.config.gdim
         return Placement(Motion(np.zeros(g), np.eye(g), self.middle), None)
@@ -110,7 +110,7 @@ class RigidSet:
         """The nearest rigid placement for a displacement ``(n_owned, gdim)`` (collective)."""
         own, arms, g = u[self.nodes], self.X - self.middle, self.config.gdim
         if not self.large:
-            z = self.motion_of(self.drawn, u)
+            z = self.motion_of(self.reference, u)
             return Placement(Motion(z[:g], np.eye(g), self.middle), z[g:])
         sums = self._mean(np.concatenate([own[:, :, None], own[:, :, None] * arms[:, None, :]], axis=2))
         spread = self._mean(arms[:, :, None] * arms[:, None, :])

@@ -1,4 +1,4 @@
-"""Nodes that equations of users give one displacement, up to a jump, such as both sides of the seam of a periodic body."""
+"""Nodes that have one displacement, up to a jump, by equations of users, such as both sides of the seam of a periodic body."""
 
 from __future__ import annotations
 
@@ -15,22 +15,19 @@ from uem_dolfinx.parallel import reduced
 
 
 class Seams:
-    """Equations of users by which two nodes have one displacement, up to a jump; each rank has those that were given on it.
-
-    Args:
-        given: equations of this rank, several lists.
+    """Equations of users by which two nodes have one displacement, up to a jump.
 
     Attributes:
-        given: the same.
+        given: equations that were given on this rank, several lists.
     """
 
     def __init__(self, given: Sequence[GivenRows]):
         self.given = given
-        self._terms = [_of_something(one.row, one.node, one.coefficients) for one in given]
-        self._alike = np.concatenate([np.zeros((0, 3), np.int64), *(_differences(*terms) for terms in self._terms)])
+        self._terms = [_nonzero(one.row, one.node, one.coefficients) for one in given]
+        self._differences = np.concatenate([np.zeros((0, 3), np.int64), *(_differences(*terms) for terms in self._terms)])
 
     def groups(self, space: Nodes, nodes: Indices) -> tuple[Ints, Ints]:
-        """Groups of nodes with one displacement, those with one of the given nodes, equal on all ranks (collective).
+        """Groups of nodes with one displacement that contain one of the given nodes, the same on all ranks (collective).
 
         Args:
             space: all nodes.
@@ -42,14 +39,14 @@ class Seams:
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
-        here, before, ends = np.zeros((space.n_owned, 1)), -1, self._alike[:, :2]
+        here, before, ends = np.zeros((space.n_owned, 1)), -1, self._differences[:, :2]
         here[nodes] = 1.0
-        # a group may go on in nodes that are no contactors
+        # groups may contain nodes that are not contactors
         while (marked := int(reduced(space.comm, int(here.sum())))) > before:
             some = space.ask_owners(ends.ravel(), here).reshape(-1, 2).any(axis=1)
             reached = space.add_at_owners(ends[some].ravel(), np.ones((2 * some.sum(), 1)))
             here, before = np.sign(here + reached), marked
-        every = np.unique(np.concatenate(space.comm.allgather(self._alike[some])), axis=0)
+        every = np.unique(np.concatenate(space.comm.allgather(self._differences[some])), axis=0)
         pairs, count = np.unique(every[:, :2], axis=0, return_counts=True)
         node, at = np.unique(pairs[count == space.block], return_inverse=True)
         start, end = at.reshape(-1, 2).T
@@ -57,17 +54,14 @@ class Seams:
         return node, connected_components(graph, directed=False)[1].astype(int)
 
     def others(self, known: Ints, group: Ints) -> list[tuple[Ints, Ints]]:
-        """Row and global node of each term that is not between nodes of one group, list by list; arguments as from ``groups``."""
-        return [_others(row, groups_of(node, known, group), len(known), node) for row, node, _ in self._terms]
-
-
-def _others(row: Ints, group: Ints, highest: int, node: Ints) -> tuple[Ints, Ints]:
-    """Terms of the equations that are not between two nodes of one group."""
-    m = int(row.max(initial=-1)) + 1
-    lowest = np.full(m, highest)
-    np.minimum.at(lowest, row, group)
-    alike = (lowest >= 0) & (np.bincount(row, group != lowest[row], m) == 0)
-    return row[~alike[row]], node[~alike[row]]
+        """Row and global node of the terms of equations that have nodes of other groups, by lists; arguments as from ``groups``."""
+        found = []
+        for row, node, _ in self._terms:
+            own, lowest = groups_of(node, known, group), np.full(int(row.max(initial=-1)) + 1, len(known))
+            np.minimum.at(lowest, row, own)
+            within = (lowest >= 0) & (np.bincount(row, own != lowest[row], len(lowest)) == 0)
+            found.append((row[~within[row]], node[~within[row]]))
+        return found
 
 
 def seams_of(config: Configuration) -> Seams | None:
@@ -85,7 +79,7 @@ def groups_of(nodes: Ints, known: Ints, group: Ints) -> Ints:
     return np.where(known[place] == nodes, group[place], -1)
 
 
-def _of_something(row: Ints, node: Ints, coefficients: Array) -> tuple[Ints, Ints, Array]:
+def _nonzero(row: Ints, node: Ints, coefficients: Array) -> tuple[Ints, Ints, Array]:
     """The terms without those whose coefficients are zero."""
     some = np.abs(coefficients).max(axis=1, initial=0.0) > NEGLIGIBLE
     return row[some], node[some], coefficients[some]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.conditions.equation import GivenRows, LinearEquations, rows_of, values_of
 from uem_dolfinx.conditions.independent_rows import Solved, divided, eliminated, singles, sizes
 from uem_dolfinx.errors import ConflictError
@@ -38,17 +38,10 @@ class UnitedRows:
 
     Attributes:
         equations: of this rank, with the gaps of the last call of ``at_present``.
-        multipliers: forces of the equations along their eliminated components ``(m,)``, as last set.
-        turns: rotations for checkpoints, here empty.
-        turning: whether rows depend on the displacement, here False.
-        rigid: rigid couplings, here None.
 
     Raises:
         ConflictError: for equations without a component to eliminate, and for equations that follow from others or contradict them.
     """
-
-    turning = False
-    rigid = None
 
     def __init__(
         self,
@@ -60,21 +53,19 @@ class UnitedRows:
         at: float = 0.0,
     ):
         self._config, self._declared = config, list(declared)
-        self.turns: list[Any] = []
         counts = [one.n_values(config.block) for one in self._declared]
         self._n_values = sum(counts)
-        self._asked: list[Any] = [None] * len(counts)
-        ramped = [_grows(one.b, loaded) for one in self._declared]
+        self._evaluated: list[Any] = [None] * len(counts)
+        ramped = [is_ramped(one.b, loaded) for one in self._declared]
         self._make(np.cumsum([0, *counts]), free, contactors)
         self._halo = Halo(config, self.equations.followed)
         left = self._left
         self._left_halo = Halo(config, left.node)
-        grows = np.repeat(ramped, counts)
+        every = np.repeat(ramped, counts)
         #: Mask of rows whose values are ramped with the Dirichlet values, and the same for the equations that were left out.
-        self._ramped = np.asarray(self._weights[:, ~grows].getnnz(axis=1) == 0), grows[left.value]
+        self._ramped = np.asarray(self._weights[:, ~every].getnnz(axis=1) == 0), every[left.value]
         #: Left-hand sides at the beginning of the ramp, of rows and of equations left out, and the fraction of the ramp.
         self._start, self._fraction = (np.zeros(len(self.equations)), np.zeros(len(left))), 1.0
-        self.multipliers: Array = np.zeros(len(self.equations))
         self.take_load(at)
         self._wanted = self._values()
 
@@ -155,19 +146,19 @@ class UnitedRows:
         """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
         for i, one in enumerate(self._declared):
             if callable(one.b) and not isinstance(one.b, fem.Constant):
-                self._asked[i] = ask_together(self._config.comm, f"the value of equations[{i}] at {at:.6g}", one.b, at)
+                self._evaluated[i] = ask_together(self._config.comm, f"the value of equations[{i}] at {at:.6g}", one.b, at)
 
     def given_values(self) -> dict[str, Any]:
         """Present right-hand sides, by name."""
-        now = [one.b if asked is None else asked for one, asked in zip(self._declared, self._asked)]
+        now = [one.b if known is None else known for one, known in zip(self._declared, self._evaluated)]
         return {f"the value of equations[{i}]": value for i, value in enumerate(now)}
 
     def _values(self) -> Array:
         """Present right-hand sides ``(n_values,)`` (collective)."""
         with agreed(self._config.comm):
             found = [
-                values_of(f"the value of equations[{i}]", one.b if asked is None else asked, one.n_values(self._config.block))
-                for i, (one, asked) in enumerate(zip(self._declared, self._asked))
+                values_of(f"the value of equations[{i}]", one.b if known is None else known, one.n_values(self._config.block))
+                for i, (one, known) in enumerate(zip(self._declared, self._evaluated))
             ]
         return np.concatenate(found)
 
@@ -191,20 +182,6 @@ class UnitedRows:
     def _targets(self, b: Array, start: Array, ramped: Bools) -> Array:
         return np.where(ramped, start + self._fraction * (b - start), b) if self._fraction < 1.0 else b
 
-    def place(self) -> None:
-        """Nothing: the equations are linear."""
-
-    def curvature(self) -> list[tuple[Ints, Array]]:
-        """Nothing: the equations are linear."""
-        return []
-
-    def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
-        """Nothing: the equations are linear."""
-        return []
-
-    def settle(self, dynamics: Any) -> None:
-        """Nothing: the equations are linear."""
-
     def at_present(self) -> UnitingEquations:
         """The equations with the gaps of the present displacement (collective)."""
         wanted = self._targets(self._weights @ self._wanted, self._start[0], self._ramped[0])
@@ -226,28 +203,18 @@ class UnitedRows:
         if not reduced(config.comm, len(left)):
             return
         u, b = config.displacement[: config.n_owned], self._wanted[left.value]
-        apart = np.abs(self._left_sides(u) - self._targets(b, self._start[1], self._ramped[1]))
+        misfit = np.abs(self._left_sides(u) - self._targets(b, self._start[1], self._ramped[1]))
         scale = float(reduced(config.comm, np.abs(u).max(initial=0.0), op=MPI.MAX)) + np.abs(b)
         X, error = config.ask_owners(left.node, config.X[: config.n_owned]), None
-        bad = np.flatnonzero(apart > CONTRADICTING * scale)
+        bad = np.flatnonzero(misfit > CONTRADICTING * scale)
         if len(bad):
-            i = int(bad[np.argmax(apart[bad])])
+            i = int(bad[np.argmax(misfit[bad])])
             place = ", ".join(f"{x:.6g}" for x in X[np.searchsorted(left.row, i)])
             error = ConflictError(
-                f"an equation of the node at ({place}) is missed by {apart[i]:.4g}: it is a combination of other equations and "
+                f"an equation of the node at ({place}) is missed by {misfit[i]:.4g}: it is a combination of other equations and "
                 "Dirichlet conditions, but its value contradicts theirs; give values that agree"
             )
         agree(config.comm, error)
-
-    # -- forces ----------------------------------------------------------------------------------------------------------
-
-    def forces(self, multipliers: Array) -> Array:
-        """Forces with which the equations act on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective).
-
-        Args:
-            multipliers: forces along their eliminated components ``(m,)``.
-        """
-        return forces_of(self._config, self.equations, multipliers)
 
 
 def forces_of(config: Configuration, eq: UnitingEquations, multipliers: Array) -> Array:
@@ -255,18 +222,8 @@ def forces_of(config: Configuration, eq: UnitingEquations, multipliers: Array) -
     return config.add_at_owners(np.concatenate([config.to_global(eq.node), eq.followed]), eq.forces(multipliers))
 
 
-def unite(
-    config: Configuration, declared: Sequence[LinearEquations], free: Bools, contactors: Sequence[Indices], load: Any, at: float
-) -> UnitedRows:
-    """Equations of users for a problem with these contactors ``(n,)`` of several contacts, and its load (collective)."""
-    spared = np.zeros(config.n_owned, dtype=bool)
-    for nodes in contactors:
-        spared[nodes] = True
-    return UnitedRows(config, declared, free, spared, list(load) if isinstance(load, Mapping) else [], at)
-
-
-def _grows(b: Any, loaded: Collection[fem.Constant]) -> bool:
-    """Whether a value is ramped with the Dirichlet values."""
+def is_ramped(b: Any, loaded: Collection[fem.Constant]) -> bool:
+    """Whether a right-hand side is ramped with the Dirichlet values; functions and ``loaded`` Constants are not."""
     if isinstance(b, fem.Constant):
         return not any(b is constant for constant in loaded)
     return not callable(b)

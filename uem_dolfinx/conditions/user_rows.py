@@ -1,92 +1,84 @@
-"""All equations of users together: linear equations, and rigid couplings, whose rows depend on the displacement."""
+"""All equations of users: linear equations and, after them, rigid couplings, whose rows depend on the displacement."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.conditions.rigid_coupling import RigidCoupling, constants_of
+from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.conditions.rigid_rows import RigidRows
-from uem_dolfinx.conditions.united_rows import UnitedRows, forces_of, unite
+from uem_dolfinx.conditions.united_rows import UnitedRows, forces_of
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agree
 
 
-class UserRows(Protocol):
-    """Interface of users' equations to a problem.
+class UserRows:
+    """Linear equations and rigid couplings of a problem.
+
+    Other equations must not contain components that rigid couplings eliminate: an equation at such a node would have to eliminate
+    another component of the whole rigid body.
+
+    Args:
+        config: configuration of the displacement.
+        linear: linear equations, or None.
+        rigid: rows of each coupling that makes nodes rigid.
+        couplings: all couplings.
 
     Attributes:
         equations: of this rank, as last computed.
         multipliers: forces along their eliminated components ``(m,)``, as last set.
-        turns: their data in a checkpoint.
+        turning: whether rows depend on the displacement.
     """
 
-    equations: UnitingEquations
-    multipliers: Array
-    turns: list[Any]
+    def __init__(
+        self, config: Configuration, linear: UnitedRows | None, rigid: Sequence[RigidRows], couplings: Sequence[RigidCoupling]
+    ):
+        self._config, self.linear, self.each, self._couplings = config, linear, list(rigid), list(couplings)
+        self._parts: list[UnitedRows | RigidRows] = [one for one in (linear, *rigid) if one is not None]
+        self.turning: bool = any(one.set.large for one in self.each)
+        self.equations = self._joined()
+        self.multipliers: Array = np.zeros(len(self.equations))
+
+    def _joined(self) -> UnitingEquations:
+        return UnitingEquations.join([one.equations for one in self._parts], self._config.gdim)
 
     @property
-    def turning(self) -> bool:
-        """Whether they depend on the displacement."""
+    def turns(self) -> list[Any]:
+        """Data of the couplings in a checkpoint."""
+        return [one.turns for one in self.each]
 
-    def take_load(self, at: float) -> None:
-        """Evaluate functions at a load factor or time (collective)."""
-
-    def given_values(self) -> dict[str, Any]:
-        """Present right-hand sides of linear equations, by name."""
-
-    def begin_step(self, start: Array, fraction: float) -> None:
-        """Begin a step at a fraction of a ramp that started at a displacement ``(n_owned, gdim)`` (collective)."""
-
-    def place(self) -> None:
-        """Move nodes to positions that satisfy nonlinear equations (collective)."""
-
-    def at_present(self) -> UnitingEquations:
-        """The equations at the present displacement, with its gaps (collective)."""
-
-    def largest_gap_here(self) -> float:
-        """Largest gap, a length, on this rank."""
-
-    def curvature(self) -> list[tuple[Ints, Array]]:
-        """Geometric stiffness in the tangent: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
-
-    def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
-        """Masses at points times a factor, by default of the time step, in the format of ``curvature`` (collective)."""
-
-    def settle(self, dynamics: Any) -> None:
-        """Set velocities and accelerations of nodes that are consistent with nonlinear equations (collective)."""
-
-    def check(self) -> None:
-        """End a step: refuse values that contradict each other, or Dirichlet values (collective)."""
+    @turns.setter
+    def turns(self, kept: list[Any]) -> None:
+        for one, own in zip(self.each, kept):
+            one.turns = own
 
     @property
-    def rigid(self) -> RigidNodes | None:
-        """Rigid couplings, whose rows come last, or None."""
-
-    def forces(self, multipliers: Array) -> Array:
-        """Forces of the equations on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
-
-
-class RigidNodes(Protocol):
-    """Interface of rigid couplings to other equations, which must not contain eliminated components.
-
-    An equation at a node that is eliminated already would have to eliminate another component of the whole rigid body.
-    """
+    def rigid(self) -> UserRows | None:
+        """These equations if they contain rigid couplings, or None."""
+        return self if self.each else None
 
     @property
     def n_rows(self) -> int:
-        """Number of rows on this rank."""
+        """Number of rows of rigid couplings on this rank."""
+        return sum(len(one.equations) for one in self.each)
 
     def left(self, free: Bools) -> Bools:
-        """Free components ``(n_rows, gdim)`` without those that the couplings eliminate."""
+        """Free components ``(n_owned, gdim)`` without those that the couplings eliminate."""
+        left = free.copy()
+        for one in self.each:
+            left[one.set.nodes] &= ~one.eliminated
+        return left
 
     def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
         """Equations with eliminated components replaced by the components that these follow (collective)."""
+        for one in self.each:
+            equations = one.rewritten(equations)
+        return equations
 
     def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
         """Multipliers of the couplings' equations ``(k,)`` together with other equations in their original form (collective).
@@ -96,113 +88,52 @@ class RigidNodes(Protocol):
             equations: the other equations in their original form.
             lam: their multipliers ``(m,)``.
         """
-
-
-class JoinedRows:
-    """Linear equations and rigid couplings of a problem.
-
-    Args:
-        config: configuration of the displacement.
-        linear: linear equations, or None.
-        rigid: rows of each coupling that makes nodes rigid.
-        couplings: all couplings.
-    """
-
-    def __init__(
-        self, config: Configuration, linear: UnitedRows | None, rigid: Sequence[RigidRows], couplings: Sequence[RigidCoupling]
-    ):
-        self._config, self.linear, self.each, self._couplings = config, linear, list(rigid), list(couplings)
-        self.turning: bool = any(one.set.large for one in self.each)
-        self.equations = self._joined()
-        self.multipliers: Array = np.zeros(len(self.equations))
-
-    def _joined(self) -> UnitingEquations:
-        parts = [one.equations for one in (self.linear, *self.each) if one is not None]
-        return UnitingEquations.join(parts, self._config.gdim)
-
-    @property
-    def turns(self) -> list[Any]:
-        """See ``UserRows``."""
-        return [one.turns for one in self.each]
-
-    @turns.setter
-    def turns(self, kept: list[Any]) -> None:
-        for one, own in zip(self.each, kept):
-            one.turns = own
-
-    @property
-    def rigid(self) -> JoinedRows | None:
-        """See ``UserRows``."""
-        return self if self.each else None
-
-    @property
-    def n_rows(self) -> int:
-        """See ``RigidNodes``."""
-        return sum(len(one.equations) for one in self.each)
-
-    def left(self, free: Bools) -> Bools:
-        """See ``RigidNodes``."""
-        left = free.copy()
-        for one in self.each:
-            left[one.set.nodes] &= ~one.eliminated
-        return left
-
-    def rewritten(self, equations: UnitingEquations) -> UnitingEquations:
-        """See ``RigidNodes``."""
-        for one in self.each:
-            equations = one.rewritten(equations)
-        return equations
-
-    def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
-        """See ``RigidNodes``."""
         # original equations act on the eliminated components directly
         forces = forces_of(self._config, equations, np.where(equations.active, lam, 0.0))
         parts = [np.where(one.eliminated, forces[one.set.nodes], 0.0).ravel() for one in self.each]
         return np.asarray(multipliers - np.concatenate(parts))
 
     def take_load(self, at: float) -> None:
-        """See ``UserRows``."""
+        """Evaluate functions at a load factor or time (collective)."""
         if self.linear is not None:
             self.linear.take_load(at)
         for one in self._couplings:
             one.take_load(at)
 
     def given_values(self) -> dict[str, Any]:
-        """See ``UserRows``."""
+        """Present right-hand sides of linear equations, by name."""
         return {} if self.linear is None else self.linear.given_values()
 
     def begin_step(self, start: Array, fraction: float) -> None:
-        """See ``UserRows``."""
-        for one in (self.linear, *self.each):
-            if one is not None:
-                one.begin_step(start, fraction)
+        """Begin a step at a fraction of a ramp that started at a displacement ``(n_owned, gdim)`` (collective)."""
+        for one in self._parts:
+            one.begin_step(start, fraction)
 
     def place(self) -> None:
-        """See ``UserRows``."""
+        """Move nodes to positions that satisfy nonlinear equations (collective)."""
         if self.turning:
             for one in self.each:
                 one.place()
             self._config.whole.x.scatter_forward()
 
     def at_present(self) -> UnitingEquations:
-        """See ``UserRows``."""
-        for one in (self.linear, *self.each):
-            if one is not None:
-                one.at_present()
+        """The equations at the present displacement, with its gaps (collective)."""
+        for one in self._parts:
+            one.at_present()
         self.equations = self._joined()
         return self.equations
 
     def largest_gap_here(self) -> float:
-        """See ``UserRows``."""
-        return max((one.largest_gap_here() for one in (self.linear, *self.each) if one is not None), default=0.0)
+        """Largest gap, a length, on this rank."""
+        return max((one.largest_gap_here() for one in self._parts), default=0.0)
 
     def curvature(self) -> list[tuple[Ints, Array]]:
-        """See ``UserRows``."""
+        """Geometric stiffness in the tangent: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
         parts = [one.curvature(forces) for one, forces in self._forces_of_each()] if self.turning else []
         return [part for part in parts if part is not None]
 
     def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
-        """See ``UserRows``."""
+        """Masses at points times a factor, by default of the time step, in the format of ``curvature`` (collective)."""
         return [part for part in (one.added_mass(factor) for one in self.each) if part is not None]
 
     def _forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
@@ -214,7 +145,7 @@ class JoinedRows:
             start = end
 
     def settle(self, dynamics: Any) -> None:
-        """See ``UserRows``."""
+        """Set velocities and accelerations of nodes that are consistent with nonlinear equations (collective)."""
         n, g = self._config.n_owned, self._config.gdim
         for one in (one for one in self.each if one.set.large):
             v, a = (f.x.array[: n * g].reshape(n, g).copy() for f in (dynamics.velocity, dynamics.acceleration))
@@ -222,7 +153,7 @@ class JoinedRows:
             dynamics.change_rates(v.ravel(), a.ravel())
 
     def check(self) -> None:
-        """See ``UserRows``."""
+        """End a step: refuse values that contradict each other, or Dirichlet values (collective)."""
         if self.linear is not None:
             self.linear.check()
         for one, forces in self._forces_of_each():
@@ -230,8 +161,12 @@ class JoinedRows:
             one.coupling.read_reactions(forces)
 
     def forces(self, multipliers: Array) -> Array:
-        """See ``UserRows``."""
+        """Forces of the equations on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
         return forces_of(self._config, self.equations, multipliers)
+
+
+#: Equations of users as rigid couplings.
+RigidNodes: TypeAlias = UserRows
 
 
 def _refuse_shared(coupling: RigidCoupling, taken: Bools) -> None:
@@ -267,17 +202,18 @@ def rows_of_users(
         load: of the problem.
         at: load factor or time of the first evaluation of functions.
     """
-    if not couplings:
-        return unite(config, equations, free, contactors, load, at) if equations else None
+    if not (couplings or equations):
+        return None
     avoided = np.zeros(config.n_owned, dtype=bool)
     avoided[np.concatenate([np.zeros(0, np.int32), *contactors])] = True
-    loaded, rigid, taken = constants_of(load), [], np.zeros(config.n_owned, dtype=bool)
+    loaded, rigid = list(load) if isinstance(load, Mapping) else [], []
+    taken = np.zeros(config.n_owned, dtype=bool)
     for one in couplings:
         one.take_load(at)
         if not one.distribute:
             _refuse_shared(one, taken)
             rigid.append(RigidRows(config, one, free, avoided, loaded))
-    # linear equations eliminate none of their components
+    # linear equations do not eliminate components of couplings
     left = free & ~taken[:, None]
-    linear = unite(config, equations, left, contactors, load, at) if equations else None
-    return JoinedRows(config, linear, rigid, couplings)
+    linear = UnitedRows(config, equations, left, avoided, loaded, at) if equations else None
+    return UserRows(config, linear, rigid, couplings)
