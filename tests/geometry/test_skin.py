@@ -29,7 +29,7 @@ def three(cell, *n):
 def side_middles(skin):
     """Middles of the sides of all facets of this rank, points in 2D ``(m, n_sides, gdim)``."""
     x, corners = skin.config.X[skin.dofs], 1 if skin.shape.dim == 1 else 2
-    return np.stack([x[:, nodes[:corners]].mean(axis=1) for _, nodes, _, _ in skin.shape.edges()], axis=1)
+    return np.stack([x[:, nodes[:corners]].mean(axis=1) for _, nodes, _, _ in skin.shape.edges], axis=1)
 
 
 # -- bodies ----------------------------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """Ties of a scalar field, such as a temperature, between non-matching meshes: linear equations with the weights of displacement ties.
 
-    u_i = sum_a w_a u_a        for every contactor i that is within reach of the target
+    u_i = sum_a w_a u_a        for every contactor i within reach of the target
 
 The weights are those of ``tied_rows``: shape functions at the closest point, or means over segments by dual functions.
 """
@@ -30,7 +30,7 @@ def check_ties(gdim: int, contacts: Sequence[Any], equations: Sequence[Any], **o
     Args:
         gdim: dimension of the mesh.
         contacts: of the problem.
-        equations: of the problem; without contacts and equations, a scalar field is taken for a wrong displacement.
+        equations: of the problem; without contacts and equations, the scalar field is considered a displacement of wrong size.
         others: other arguments by name; they must be None or empty.
 
     Raises:
@@ -45,16 +45,14 @@ def check_ties(gdim: int, contacts: Sequence[Any], equations: Sequence[Any], **o
         )
     for contact in contacts:
         if contact.heats:
-            raise InputError(
-                f"contact '{contact.name}': heat goes through a tie of temperatures without resistance: leave it out"
-            )
+            raise InputError(f"contact '{contact.name}': a tie of temperatures conducts heat without resistance: leave heat out")
     for name, what in others.items():
         if what:
             raise InputError(f"{name} is for displacements, and u is a scalar field: leave it out")
 
 
 class ScalarTie:
-    """One tie, as ``LinearEquations`` of the scalar field (collective).
+    """A tie as ``LinearEquations`` of the scalar field (collective).
 
     Args:
         config: nodes of the scalar field.
@@ -62,14 +60,14 @@ class ScalarTie:
         free: nodes without Dirichlet condition ``(n_owned, 1)``.
 
     Attributes:
-        followed: owned nodes of the target, eliminated only if no contactor of the equation can be.
+        followed: owned nodes of the target, eliminated only in equations without another node to eliminate.
     """
 
     firm = False
     b = 0.0
 
     def __init__(self, config: Configuration, contact: Contact, free: Bools):
-        # surfaces and segments belong to a zero displacement, with the same nodes in another numbering
+        # surfaces and segments are made for a zero displacement, which has the same nodes in another numbering
         still = Configuration(fem.Function(compat.function_space(config.mesh, config.degree, (config.gdim,))))
         place = np.zeros(still.n_local, dtype=np.int64)
         place[compat.cell_dofs(still.V)] = compat.cell_dofs(config.V)
@@ -89,7 +87,7 @@ class ScalarTie:
         order = np.argsort(rows, kind="stable")
         weights: Array = np.concatenate([np.ones(len(tied)), -weight[kept, 0]])
         found = GivenRows(np.zeros(len(tied), np.int64), rows[order], np.concatenate([own, theirs])[order], weights[order, None])
-        # if conditions prescribe both sides, interpolated values differ and there is no equation
+        # without an equation where conditions prescribe both sides, as interpolated values differ
         able = np.zeros(len(tied), dtype=bool)
         able[found.row[(sizes(config, found, free) > 0).any(axis=1)]] = True
         self._rows = found.select(able)

@@ -1,4 +1,4 @@
-"""Contacts that unite the same surfaces: forces are shared among them, and no law of the pressure of either has the whole."""
+"""Contacts of the same surfaces share the contact force, so that a law of the pressure in one of them would miss a part."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) -> None:
     """Refuse contacts on the same facets of both sides of which one has a law of the pressure (collective).
 
-    Friction and wear are such laws where the same facets are contactors of both; a conductance that is a function of the pressure is one
-    also where the sides are swapped.
+    Friction and wear are such laws if both contacts have the same contactor; a conductance that depends on the pressure also if the sides
+    are swapped.
 
     Args:
-        config: of the displacement.
-        contacts: that belong to it.
+        config: configuration of the displacement.
+        contacts: all its contacts.
 
     Raises:
         ConflictError: naming two such contacts.
@@ -34,8 +34,8 @@ def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) 
     facets = config.tdim - 1
     single = [one for one in contacts if not one.of_all_surfaces and one.tied is not True and one.contactor.dim == facets]
     conducts = np.array([any(callable(law.h) for law in one.heats) for one in single], dtype=bool)
-    rubs = np.array([one.pair.friction is not None for one in single], dtype=bool)
-    if len(single) < 2 or not (conducts | rubs).any():
+    slides = np.array([one.pair.friction is not None for one in single], dtype=bool)
+    if len(single) < 2 or not (conducts | slides).any():
         return
     own, theirs = _tables([one.contactor for one in single], [one.target for one in single])
     common = np.stack([(one @ other.T).toarray() > 0 for one, other in ((own, own), (theirs, theirs), (own, theirs))])
@@ -43,7 +43,7 @@ def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) 
     contactors, targets, swapped = common
     rigid = np.array([id(one.target) for one in single])
     targets |= rigid[:, None] == rigid
-    law = conducts | rubs
+    law = conducts | slides
     np.fill_diagonal(contactors, False)
     twice: Bools = contactors & targets & (law[:, None] | law)
     both_ways: Bools = swapped & swapped.T & (conducts[:, None] | conducts)
@@ -58,7 +58,7 @@ def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) 
 
 
 def _tables(*sides: Sequence[object]) -> list[Any]:
-    """Which of this rank's facets each tag of a side has; none of rigid surfaces."""
+    """Sparse masks of this rank's facets in the tags of each side, without facets for rigid surfaces."""
     from scipy.sparse import csr_matrix
 
     none: Indices = np.zeros(0, np.int32)

@@ -1,7 +1,7 @@
 """Bodies of revolution: a mesh of half of a plane through the axis, whose coordinates are the radius r = x and the height z = y.
 
-Integrals over such a mesh are those over the whole bodies and their surfaces: integrands are multiplied by ``2 pi r``. Nodes stand for
-circles, and nodal forces and masses are those of whole circles.
+Integrals run over the whole bodies and their surfaces: integrands are multiplied by ``2 pi r``. Nodes represent circles, and nodal forces
+and masses belong to whole circles.
 """
 
 from __future__ import annotations
@@ -29,19 +29,18 @@ _DECLARED: WeakValueDictionary[int, Any] = WeakValueDictionary()
 def axisymmetric(mesh: Any) -> Any:
     """Declare that a mesh is half of a plane through the axis of bodies of revolution: x is the radius, y the height (collective).
 
-    To be called before anything is made of the mesh. Laws on it are of ``kind="axisymmetric"``. Forms are written as in the plane, per
-    volume and per area: where the package integrates them, it multiplies them by ``2 pi r``, whether they come from its laws or are the
-    user's own.
+    Call it before the mesh is used. Laws on the mesh have ``kind="axisymmetric"``. Forms are written as in the plane, per volume and per
+    area; the package multiplies them by ``2 pi r``, both forms of its laws and forms of users.
 
     Args:
-        mesh: 2D, with no node at a negative x. The axis is no surface: where cells lie on it, prescribe a radial displacement of 0.
+        mesh: 2D, with no node at a negative x. The axis is no surface: prescribe a radial displacement of 0 on it.
 
     Returns:
         The mesh.
 
     Raises:
-        InputTypeError: if it is no mesh.
-        MeshError: if it is not plane, or has nodes beyond the axis.
+        InputTypeError: for other objects.
+        MeshError: if the mesh is not plane, or has nodes beyond the axis.
     """
     given.kind("mesh", mesh, _is_mesh(mesh), "a mesh, as read_gmsh returns it")
     gdim, tdim = mesh.geometry.dim, mesh.topology.dim
@@ -88,14 +87,14 @@ def circumference(domain: Any, u: Any = None) -> Any:
 
 
 def displacement_gradient(u: Any) -> Any:
-    """Gradient of a displacement or of its variation: ``(3, 3)`` with the hoop strain ``u_r / r`` last if axisymmetric, else ``grad(u)``.
+    """Gradient of a displacement or its variation: ``grad(u)``, or ``(3, 3)`` with the hoop strain ``u_r / r`` last in axisymmetry.
 
-    ``I + displacement_gradient(u)`` is the deformation gradient F, with ``F_33 = 1 + u_r / r``. On the axis, where no point of quadrature
-    is but nodes are, the hoop strain is that along the radius.
+    ``I + displacement_gradient(u)`` is the deformation gradient F, with ``F_33 = 1 + u_r / r``. On the axis, which contains nodes but no
+    quadrature points, the hoop strain equals the radial strain.
 
     Raises:
-        InputTypeError: if it is no UFL expression of a mesh.
-        InputError: if it is no vector with a component for each dimension of the mesh.
+        InputTypeError: if ``u`` is no UFL expression of a mesh.
+        InputError: if ``u`` is no vector with a component for each dimension of the mesh.
     """
     expected, domains = "a displacement or its variation, as a Function or a TestFunction", []
     if isinstance(u, Expr):
@@ -114,7 +113,7 @@ def displacement_gradient(u: Any) -> Any:
 
 
 def centre_of_mass(domain: Any) -> Any:
-    """Way from the middle of quadrilaterals to the mean place of their circles, in UFL: means over circles are values there ``(2,)``."""
+    """Vector ``(2,)`` in UFL from the middle of quadrilaterals to the position where linear functions equal their means over circles."""
     J = ufl.Jacobian(domain)
     return ufl.dot(J, J.T)[0, :] / (12 * ufl.SpatialCoordinate(domain)[0])
 

@@ -1,7 +1,7 @@
-"""Sharp convex edges of surfaces in 3D, and where those of two surfaces cross each other inside both bodies, between their nodes.
+"""Sharp convex edges of surfaces in 3D, and crossings of edges of two surfaces inside both bodies, between their nodes.
 
-Points of one edge and of the other that are nearest to each other lie on their common normal. Where bodies overlap, each lies behind the
-mean of the facets at the other's edge. Edges of degree 2 are two straight pieces each.
+The nearest points of two edges lie on their common normal. If the bodies overlap, each point lies behind the mean of the facets at the
+other edge. An edge of degree 2 consists of two straight pieces.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.sharp import sharp_edges
 from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
 
-#: Edges that cross less deep than this part of the shorter one have met by what facets are bent between their nodes.
+#: Shallower crossings are caused by facets that are curved between their nodes.
 #: [convention; length of an edge between nodes; test_crossing_edges.py::test_how_deep_edges_cross]
 DEEP = 0.02
 
 
 class Crossing(NamedTuple):
-    """The deepest of the places where edges cross.
+    """The deepest crossing of edges.
 
     Attributes:
         depth: a length.
-        place: of the middle ``(3,)``.
-        n_pairs: number of pairs of edges that cross, each of which two facets have.
+        place: middle of the crossing ``(3,)``.
+        n_pairs: number of pairs of edges that cross, counted for both facets of each edge.
     """
 
     depth: float
@@ -38,7 +38,7 @@ class Crossing(NamedTuple):
 class SharpEdges:
     """Sharp convex edges within a surface of 3D bodies, in straight pieces between neighbouring nodes (collective).
 
-    Both facets at an edge have it.
+    Each edge occurs twice, once for each of its facets.
 
     Args:
         facets: of the surface.
@@ -51,9 +51,9 @@ class SharpEdges:
     def __init__(self, facets: TargetFacets):
         self.facets, comm = facets, facets.config.comm
         convex = sharp_edges(facets).convex
-        sides = [nodes for _, nodes, _, _ in facets.shape.edges()]
+        sides = [nodes for _, nodes, _, _ in facets.shape.edges]
         self._keys, (facet, side) = facets.side_keys()[convex.ravel()], np.nonzero(convex)
-        #: One for each side ``(n,)``, and the ends of its pieces, which it has one or two of.
+        #: Facet of each side ``(n,)``, and the ends of its one or two pieces.
         self._facet: Ints = facet
         order = np.array([[nodes[0], *nodes[2:], nodes[1]] for nodes in sides])
         along = facets.dofs[facet[:, None], order[side]]
@@ -74,13 +74,13 @@ class SharpEdges:
         return config.x[self._ends], np.repeat(sums_by_keys(config.comm, self._keys, normal[self._facet]), self._pieces, axis=0)
 
 
-def find_crossing(own: SharpEdges, theirs: SharpEdges, told: tuple[Ints, Ints], meet: Any) -> Crossing | None:
+def find_crossing(own: SharpEdges, theirs: SharpEdges, keys: tuple[Ints, Ints], meet: Any) -> Crossing | None:
     """The deepest crossing of edges of two surfaces, which may be identical; None without crossing (collective).
 
     Args:
-        own: edges of the one.
+        own: edges of one surface.
         theirs: edges of the other.
-        told: visibility keys of the edge segments of both ``(k, m)``.
+        keys: visibility keys of the edge segments of both ``(k, m)``.
         meet: function of two arrays of keys ``(n, m)`` that returns whether segments may meet ``(n,)``.
     """
     comm = own.facets.config.comm
@@ -88,13 +88,13 @@ def find_crossing(own: SharpEdges, theirs: SharpEdges, told: tuple[Ints, Ints], 
     (c, r), (d, q) = (_balls(z) for z in (x, y))
     box = np.stack([(d - q[:, None]).min(axis=0, initial=np.inf), (d + q[:, None]).max(axis=0, initial=-np.inf)])
     rows = [np.flatnonzero(((c - r[:, None] <= b[1]) & (c + r[:, None] >= b[0])).all(axis=1)) for b in gathered(comm, box)]
-    a, na, nodes, what = Exchange(comm, rows).send(x, n, own.nodes, told[0])
+    a, na, nodes, key = Exchange(comm, rows).send(x, n, own.nodes, keys[0])
     depth, place = np.zeros(0), np.zeros((0, 3))
     if len(a) and len(y):
         c, r = _balls(a)
         i, j = balls_that_meet(c, r, d, q)
-        apart = (nodes[i][:, :, None] != theirs.nodes[j][:, None]).all(axis=(1, 2))
-        some = apart & meet(what[i], told[1][j])
+        disjoint = (nodes[i][:, :, None] != theirs.nodes[j][:, None]).all(axis=(1, 2))
+        some = disjoint & meet(key[i], keys[1][j])
         i, j = i[some], j[some]
         depth, place = _depths((a[i], na[i]), (y[j], m[j]))
         deep = depth > 2.0 * DEEP * np.minimum(r[i], q[j])
@@ -112,7 +112,7 @@ def _balls(x: Array) -> tuple[Array, Array]:
 
 
 def _depths(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
-    """How deep edges cross inside both bodies ``(k,)``, 0 where they do not, and middles of the nearest points ``(k, 3)``.
+    """Depths of crossings inside both bodies ``(k,)``, 0 without crossing, and middles of the nearest points ``(k, 3)``.
 
     Args:
         one: ends ``(k, 2, 3)`` and normals ``(k, 3)`` of the first.
@@ -122,7 +122,7 @@ def _depths(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array
     e, f, w = a[:, 1] - a[:, 0], b[:, 1] - b[:, 0], b[:, 0] - a[:, 0]
     ee, ff, ef, ew, fw = (np.einsum("kg,kg->k", p, q) for p, q in ((e, e), (f, f), (e, f), (e, w), (f, w)))
     square = ee * ff - ef**2
-    # edges along each other have no common normal
+    # parallel edges have no common normal
     across = square > np.finfo(float).eps ** 0.5 * ee * ff
     over = np.where(across, square, 1.0)
     s, t = (ew * ff - fw * ef) / over, (ew * ef - fw * ee) / over

@@ -1,8 +1,8 @@
 """Crossings of straight paths of points with moving facets: exact times, and entry into or exit from the body.
 
-Facets are cut into simplices between neighbouring nodes, whose nodes move straight as the points do: the height of a point over the
-plane of its simplex is a cubic of time (in 2D a square), which is bracketed between its extremes. Of one body that turns and bends ways
-are straight as seen from the facets, which turn with what is around them.
+Facets are cut into simplices between neighbouring nodes. Points and nodes move on straight paths, so that the height of a point over the
+plane of a simplex is a cubic polynomial of time (in 2D quadratic); its roots are bracketed by its extremes. For a body that rotates and
+deforms, paths are straight relative to the facets, which rotate with the body around them.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def find_crossings(
         end: the same at the end.
         sign: 1 where a simplex is numbered so that its normal points out of its body, -1 where it points inwards ``(m,)``.
         reach: length by which each point's path is extended at both ends, so that points at rest on a facet cross it.
-        meet: which of points and simplices ``(k,)`` each count; None are all.
+        meet: mask of pairs of points and simplices ``(k,)`` that count; None for all pairs.
         turning: whether paths are straight relative to the rotating simplices, not in space.
     """
     (p0, x0), (p1, x1) = start, end
@@ -91,7 +91,7 @@ def find_crossings(
     times = np.stack(_extremes(lambda t: height(t, every)[0], -further, 1.0 + further))
     volumes, _, normals = (np.stack(parts) for parts in zip(*(height(t, every) for t in times)))
     passed, leaves = volumes >= 0, np.abs(volumes) > BY_ROUNDING * reach * np.linalg.norm(normals, axis=2)
-    # from one bound to the next, all of which are halved together
+    # intervals between extremes that contain a root
     interval, k = np.nonzero((passed[:-1] != passed[1:]) & leaves[:-1] & leaves[1:])
     low, high, falls = times[interval, k], times[interval + 1, k], passed[interval, k]
     for _ in range(HALVINGS if len(k) else 0):
@@ -110,7 +110,7 @@ def cross_target(
     points: tuple[Array, Array],
     nodes: tuple[Array, Array],
     reach: float,
-    told: Ints,
+    keys: Ints,
     meet: Callable[[Ints, Ints], Bools],
     turning: bool = False,
 ) -> Crossings:
@@ -122,7 +122,7 @@ def cross_target(
         points: at the beginning and at the end ``(k, gdim)`` each.
         nodes: of this rank's facets at the beginning and at the end ``(m, nn, gdim)`` each.
         reach: see ``find_crossings``.
-        told: visibility keys of the points ``(k, ...)``.
+        keys: visibility keys of the points ``(k, ...)``.
         meet: function of these keys and this rank's facets ``(k,)`` that returns whether crossings count.
         turning: see ``find_crossings``.
     """
@@ -133,9 +133,9 @@ def cross_target(
     box = np.array([lowest.min(axis=0, initial=np.inf) - reach, highest.max(axis=0, initial=-np.inf) + reach])
     rows = [np.flatnonzero(((low <= b[1]) & (high >= b[0])).all(axis=1)) for b in comm.allgather(box)]
     there = Exchange(comm, rows)
-    q0, q1, number, told, home = there.send(p0, p1, which, told, np.full(len(which), comm.rank))
+    q0, q1, number, keys, home = there.send(p0, p1, which, keys, np.full(len(which), comm.rank))
     sign = np.repeat(target.facets.sign, len(pieces))
-    found = find_crossings((q0, x0), (q1, x1), sign, reach, lambda i, f: meet(told[i], f // len(pieces)), turning)
+    found = find_crossings((q0, x0), (q1, x1), sign, reach, lambda i, f: meet(keys[i], f // len(pieces)), turning)
     back, facet = Exchange.to(comm, home[found.point]), found.facet // len(pieces) + target.first[comm.rank]
     return Crossings(*back.send(number[found.point], facet, found.way, found.time, found.inwards, found.normal))
 
@@ -154,10 +154,10 @@ def entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
 
 
 def _carried_along(p0: Array, x0: Array, x1: Array, i: Ints, f: Ints) -> tuple[Array, Array]:
-    """Where points ``p0 (n, gdim)`` and simplices ``x0 (m, gdim, gdim)`` would be had they gone rigidly as simplices go to ``x1``.
+    """Points ``p0 (n, gdim)`` and simplices ``x0 (m, gdim, gdim)``, moved by the rigid motions of the simplices to ``x1``.
 
     Returns:
-        Points ``i (k,)`` had they gone with simplices ``f (k,)``, ``(k, gdim)``, and these ``(k, gdim, gdim)``.
+        Points ``i (k,)`` moved with simplices ``f (k,)``, ``(k, gdim)``, and these simplices ``(k, gdim, gdim)``.
     """
     middle, there = x0.mean(axis=1), x1.mean(axis=1)
     some, which = np.unique(f, return_inverse=True)
@@ -169,7 +169,7 @@ def _carried_along(p0: Array, x0: Array, x1: Array, i: Ints, f: Ints) -> tuple[A
 
 
 def _pass_by(p0: Array, p1: Array, x0: Array, x1: Array, reach: float) -> tuple[Bools, Array]:
-    """Which points come near the middles of simplices, as far as their nodes lie from these, and lengths of ways from there ``(k,)``."""
+    """Mask of points that pass the middles of simplices within their radius and the reach, and lengths of relative paths ``(k,)``."""
     middles = x0.mean(axis=1), x1.mean(axis=1)
     radius = np.stack([np.linalg.norm(x - m[:, None], axis=2).max(axis=1, initial=0.0) for x, m in zip((x0, x1), middles)])
     a, b = p0 - middles[0], p1 - middles[1]
@@ -181,7 +181,7 @@ def _pass_by(p0: Array, p1: Array, x0: Array, x1: Array, reach: float) -> tuple[
 
 
 def _boxes(start: Array, end: Array, balls: bool = False) -> tuple[Array, Array]:
-    """Lower and upper corners of the boxes about ways of nodes ``(m, k, gdim)``, or about the balls about these ``(m, gdim)``."""
+    """Lower and upper corners ``(m, gdim)`` of boxes around the paths of nodes ``(m, k, gdim)``, or around balls around these."""
     both = np.concatenate([start, end], axis=1)
     low, high = both.min(axis=1), both.max(axis=1)
     if not balls:
@@ -191,9 +191,9 @@ def _boxes(start: Array, end: Array, balls: bool = False) -> tuple[Array, Array]
 
 
 def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float, boxes: bool) -> tuple[Ints, Ints]:
-    """Points and simplices whose ways can meet, ``(k,)`` each: balls about both ways intersect, and so do ``boxes``.
+    """Points and simplices whose paths can meet ``(k,)`` each: balls around both paths intersect, and so do ``boxes``.
 
-    Balls hold those as well whose ways meet as seen from a simplex that turns by a right angle or less.
+    The balls also contain paths relative to a simplex that rotates by at most a right angle.
     """
     if not len(p0) or not len(x0):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -207,7 +207,7 @@ def _near(p0: Array, p1: Array, x0: Array, x1: Array, reach: float, boxes: bool)
 
 
 def _normals(x: Array, as_long: bool = False) -> Array:
-    """Normals of simplices ``x (k, gdim, gdim)`` in the sense of their numbering, as long as these are large, or ``as_long`` as sides."""
+    """Normals of simplices ``x (k, gdim, gdim)`` in the sense of their numbering, of their size, or ``as_long`` as their sides."""
     t = x[:, 1:] - x[:, :1]
     if x.shape[1] == 2:
         return np.stack([t[:, 0, 1], -t[:, 0, 0]], axis=1)
@@ -229,7 +229,7 @@ def _extremes(f: Callable[[Array], Array], low: Array, high: Array) -> list[Arra
 
 
 def _contain_origin(x: Array) -> Bools:
-    """Which simplices ``x (k, gdim, gdim)``, in whose plane the origin lies, contain it."""
+    """Which simplices ``x (k, gdim, gdim)`` contain the origin, which lies in their planes."""
     t = x[:, 1:] - x[:, :1]
     m = np.einsum("kag,kbg->kab", t, t)
     flat = np.linalg.det(m) <= 0.0

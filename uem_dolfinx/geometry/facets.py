@@ -119,12 +119,12 @@ class TargetFacets:
     def side_keys(self) -> Ints:
         """Key of each side of each facet, equal on both facets that share it ``(m n_sides, k)``."""
         corners = 1 if self.shape.dim == 1 else 2
-        sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges()]
+        sides = [np.sort(self.nodes[:, nodes[:corners]], axis=1) for _, nodes, _, _ in self.shape.edges]
         return np.stack(sides, axis=1).reshape(-1, corners)
 
     def _open_sides(self) -> npt.NDArray[np.bool_]:
         """Sides of each facet that bound the surface ``(m, n_sides)``: they belong to one target facet only."""
-        return (count_keys(self.config.comm, self.side_keys()) == 1).reshape(len(self.nodes), len(self.shape.edges()))
+        return (count_keys(self.config.comm, self.side_keys()) == 1).reshape(len(self.nodes), len(self.shape.edges))
 
     def _open_nodes(self) -> npt.NDArray[np.bool_]:
         """Nodes of each facet on a side, of any facet, that bounds the surface ``(m, nn)`` (collective)."""
@@ -132,7 +132,7 @@ class TargetFacets:
 
     def on_sides(self, which: Bools) -> Bools:
         """Local nodes on the sides ``which (m, n_sides)`` of facets of any rank ``(n_local,)`` (collective)."""
-        sides = enumerate(self.shape.edges())
+        sides = enumerate(self.shape.edges)
         dofs = np.concatenate([self.dofs[which[:, s]][:, nodes].ravel() for s, (_, nodes, _, _) in sides])
         return self.config.to_owners(dofs, np.ones(len(dofs))) > 0
 

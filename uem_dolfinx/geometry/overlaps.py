@@ -1,8 +1,8 @@
-"""Segments: where the facets of two surfaces lie upon each other, and quadrature there. Pure geometry of pairs of facets.
+"""Segments: overlaps of facets of two surfaces, and quadrature on them. Pure geometry of pairs of facets.
 
-A contactor facet has one normal n of its own. Its corners and those of a target facet are projected along n into its mean plane; what
-the two polygons have in common is a *segment*. Integrals run over the segments in that plane, so that the forces at one quadrature
-point lie on one line along n, and leave neither force nor moment behind.
+Each contactor facet has one normal n. The corners of both facets are projected along n into the mean plane of the contactor facet; the
+intersection of the two polygons is a *segment*. Integrals run over the segments in that plane, so that the two forces at a quadrature point
+lie on one line along n, without a resulting force or moment.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Ints, cross_products
 from uem_dolfinx.geometry.shapes import FacetShape
 
-#: A segment that is smaller is rounding of two sides that coincide.
+#: Smaller segments are rounding of sides that coincide.
 #: [convention; part of the contactor facet; test_overlaps.py::test_slivers]
 SLIVER = 1e-12
-#: Maps of facets that depart less from affine ones are integrated like these, to 1e-12.
+#: Facets whose maps differ less from affine maps are integrated like affine facets, to 1e-12.
 #: [convention; part of the largest facet; test_overlaps.py::test_facets_that_are_affine]
 STRAIGHT = 0.01
-#: Rules are by so much of a higher degree where maps depart more, and products of shape functions are no polynomials.
+#: Increase of the degree of quadrature where maps differ more, and products of shape functions are no polynomials.
 #: [convention; degree; test_overlaps.py::test_products_that_are_no_polynomials]
 BENT = 8
-#: Newton iterations for the place of a point in the plane of a facet whose map is not affine.
+#: Newton iterations for the position of a point in the plane of a facet whose map is not affine.
 #: [bound; iterations; -]
 IN_MEAN_PLANE = 12
 
@@ -41,8 +41,8 @@ class Planes:
 
     Attributes:
         origin: a corner ``(m, gdim)``.
-        axes: orthonormal, the facet's in the plane and then the outward normal ``(m, gdim, gdim)``.
-        size: of the facets projected into it, a length or an area ``(m,)``.
+        axes: orthonormal: axes in the plane, then the outward normal ``(m, gdim, gdim)``.
+        size: length or area of the facets projected into the planes ``(m,)``.
     """
 
     origin: Array
@@ -51,7 +51,7 @@ class Planes:
 
     @classmethod
     def of(cls, shape: FacetShape, x: Array, sign: Array) -> Planes:
-        """The planes of facets with nodes ``x (m, nn, gdim)``, whose own parametrisation's normal times ``sign (m,)`` is outward."""
+        """The planes of facets with nodes ``x (m, nn, gdim)``; the normal of the parametrisation times ``sign (m,)`` is outward."""
         corner = x[:, : len(shape.topology[0])]
         along = corner[:, 1] - corner[:, 0]
         if shape.dim == 1:
@@ -59,11 +59,9 @@ class Planes:
             t = along / size[:, None]
             n = np.stack([t[:, 1], -t[:, 0]], axis=1) * sign[:, None]
             return cls(corner[:, 0], np.stack([t, n], axis=1), size)
-        # of a quadrilateral the diagonals span the mean plane
-        ends = (corner[:, 3] - corner[:, 0], corner[:, 2] - corner[:, 1]) if shape.cell == "quadrilateral" else (
-            along, corner[:, 2] - corner[:, 0],
-        )  # fmt: skip
-        area = 0.5 * cross_products(*ends)
+        # the diagonals of a quadrilateral span its mean plane
+        last, start = (3, 1) if shape.cell == "quadrilateral" else (1, 0)
+        area = 0.5 * cross_products(corner[:, last] - corner[:, 0], corner[:, 2] - corner[:, start])
         size = np.linalg.norm(area, axis=1)
         n = area / size[:, None] * sign[:, None]
         t = along - np.einsum("mg,mg->m", along, n)[:, None] * n
@@ -76,11 +74,11 @@ class Planes:
         return self.axes[:, -1]
 
     def take(self, which: Ints) -> Planes:
-        """Some of them, repeated or not."""
+        """Planes with these numbers, which may be repeated."""
         return Planes(self.origin[which], self.axes[which], self.size[which])
 
     def coordinates(self, x: Array) -> Array:
-        """Coordinates of points ``x (m, k, gdim)``, those in the plane and then the height ``(m, k, gdim)``."""
+        """Coordinates of points ``x (m, k, gdim)``: in the plane, then the height ``(m, k, gdim)``."""
         return np.einsum("mkg,mfg->mkf", x - self.origin[:, None], self.axes)
 
 
@@ -93,7 +91,7 @@ class Segments:
         xi: reference coordinates on the contactor facet ``(q, fdim)``.
         eta: on the target facet ``(q, fdim)``.
         weight: of the quadrature in the mean plane, a length or an area ``(q,)``.
-        gap: from the contactor to the target along the contactor's normal ``(q,)``.
+        gap: distance from the contactor to the target along the contactor's normal ``(q,)``.
     """
 
     pair: Ints
@@ -126,9 +124,7 @@ def _affine(shape: FacetShape, y: Array) -> bool:
     return bool(np.abs(y - made).max(initial=0.0) <= STRAIGHT * np.abs(y - y[:, :1]).max(initial=0.0))
 
 
-def overlap(
-    planes: Planes, contactor: tuple[FacetShape, Array], target: tuple[FacetShape, Array], sign: Array, facet: Ints
-) -> Segments:
+def overlap(planes: Planes, contactor: Facets, target: Facets, sign: Array, facet: Ints) -> Segments:
     """Segments of pairs of facets.
 
     Args:
@@ -181,7 +177,7 @@ def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, ru
         polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
         a, b, c = corners[polygon, 0], corners[polygon, first + 1], corners[polygon, first + 2]
     else:
-        # no rule is exact here: where sides coincide, a sliver more or less would change all triangles about a corner
+        # no rule is exact here: if sides coincide, one more sliver would change all triangles about a corner
         i = np.arange(corners.shape[1])
         polygon, first = np.nonzero(i < count[:, None])
         after = np.where(i + 1 < count[:, None], i + 1, 0)
@@ -192,21 +188,21 @@ def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, ru
 
 
 def clip(subject: Array, frame: Array) -> tuple[Array, Ints]:
-    """What convex polygons have in common with convex frames, all at once (Sutherland and Hodgman, 1974, doi:10.1145/360767.360802).
+    """Intersections of convex polygons with convex frames (Sutherland and Hodgman, 1974, doi:10.1145/360767.360802).
 
     Args:
         subject: corners in either order ``(m, k, 2)``.
         frame: corners counter-clockwise ``(m, l, 2)``.
 
     Returns:
-        Corners ``(m, k + l, 2)`` and how many of them there are ``(m,)``.
+        Corners ``(m, k + l, 2)`` and their number ``(m,)``.
     """
     m, k, _ = subject.shape
     left, corners, count = np.arange(m), subject, np.full(m, k)
     for a in range(frame.shape[1]):
         start, along = frame[left, a], frame[left, (a + 1) % frame.shape[1]] - frame[left, a]
         corners, count = _cut(corners, count, start, along)
-        # nothing is left of some
+        # some polygons are empty now
         some = np.flatnonzero(count)
         left, corners, count = left[some], corners[some], count[some]
     every, counts = np.zeros((m, *corners.shape[1:])), np.zeros(m, dtype=np.int64)
@@ -215,7 +211,7 @@ def clip(subject: Array, frame: Array) -> tuple[Array, Ints]:
 
 
 def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array, Ints]:
-    """What lies on the left of lines; polygons may have one more corner then."""
+    """Parts of polygons to the left of lines, which may have one more corner."""
     m, k, _ = corners.shape
     i = np.arange(k)
     real = i < count[:, None]
@@ -230,21 +226,21 @@ def _cut(corners: Array, count: Ints, start: Array, along: Array) -> tuple[Array
     polygon, corner, which = np.nonzero(kept)
     count = kept.sum(axis=(1, 2))
     place = np.arange(len(polygon)) - np.repeat(np.cumsum(count) - count, count)
-    # convex polygons get one more at most, those that rounding has bent may get others
+    # convex polygons get at most one more corner, polygons bent by rounding may get more
     left = np.zeros((m, max(k + 1, int(count.max(initial=0))), 2))
     left[polygon, place] = np.where(which[:, None] == 0, corners[polygon, corner], met[polygon, corner])
     return left, count
 
 
 def _following(values: Array, count: Ints) -> Array:
-    """What the next corners of polygons have, by the number of these ``(m,)``, of ``values (m, k, ...)`` at their corners."""
+    """Values at the next corners of polygons, from ``values (m, k, ...)`` at their corners, of which ``count (m,)`` are used."""
     after = np.roll(values, -1, axis=1)
     after[np.arange(len(count)), count - 1] = values[:, 0]
     return after
 
 
 def _fan(corners: Array, count: Ints) -> tuple[Array, Array]:
-    """Twice the signed areas of the triangles about the first corner ``(m, k - 2)``, and the arms to the others ``(m, k, 2)``."""
+    """Twice the signed areas of the triangles about the first corner ``(m, k - 2)``, and arms from it to all corners ``(m, k, 2)``."""
     arm = corners - corners[:, :1]
     part = cross(arm[:, 1:-1], arm[:, 2:])
     return np.where(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1, part, 0.0), arm
@@ -263,7 +259,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def locate(shape: FacetShape, y: Array, at: Array) -> Array:
-    """Reference coordinates of the points of facets with nodes ``y (q, nn, fdim)`` in a plane that lie at ``at (q, fdim)``."""
+    """Reference coordinates of points ``at (q, fdim)`` in the plane of facets with nodes ``y (q, nn, fdim)``."""
     sides = y[:, 1 : shape.dim + 1] - y[:, :1]
     xi = _solve(sides.transpose(0, 2, 1), at - y[:, 0])
     if shape.affine:

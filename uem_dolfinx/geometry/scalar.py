@@ -1,4 +1,4 @@
-"""Nodes of a scalar field that is solved for by itself, as a temperature: they have one unknown each, and stay where they are."""
+"""Nodes of a scalar field that is the only unknown, such as a temperature: one unknown each, and fixed positions."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ class ScalarConfiguration(Configuration):
         self.axisymmetric = is_axisymmetric(V.mesh)
 
     def place_of(self, unknown: int) -> str:
-        """Where the node of a local unknown is, for error messages."""
+        """Position of the node of a local unknown, for error messages."""
         return f"the value at {self.describe(unknown)}"
 
     @property
     def x(self) -> Array:
-        """Positions of the local nodes ``(n_local, gdim)``, which are those of the mesh."""
+        """Positions of the local nodes ``(n_local, gdim)``: the reference positions."""
         return self.X
 
     def modes(self, centred: bool = False) -> Array:
-        """The constant, which conduction does not resist ``(n_owned, 1, 1)``."""
+        """The constant field, which conduction does not resist ``(n_owned, 1, 1)``."""
         return Nodes.modes(self, centred)
 
     def of_circles(self, vectors: Array) -> Array:
-        """As they are: sums of scalars around an axis do not cancel."""
+        """The unchanged vectors: sums of scalars around an axis do not cancel."""
         return vectors

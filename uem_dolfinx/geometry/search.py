@@ -276,7 +276,7 @@ class MeshTarget:
         if open_sides is None:
             open_sides = of.open_sides[facet]
         else:
-            for s, (_, nodes, _, _) in enumerate(self.shape.edges()):
+            for s, (_, nodes, _, _) in enumerate(self.shape.edges):
                 open_nodes[:, nodes] |= open_sides[:, s, None]
         return Feet(
             facet + self.first[self.comm.rank], of.keys[facet], xi, data.x[facet], data.nodes[facet], data.nodal_normals[facet],

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from uem_dolfinx.arrays import Array, Indices, cross_products
 from uem_dolfinx.forms import create_lagrange_element, quadrature_rule, reference_topology
 
-#: Newton iterations for the place of a point in the plane of a facet; one is enough where the facet's map is affine.
+#: Newton iterations for the position of a point in the plane of a facet; one is sufficient if the map of the facet is affine.
 #: [bound; iterations; -]
 IN_PLANE = 4
 
@@ -38,10 +38,7 @@ class FacetShape:
         self.topology = reference_topology(cell) if self.dim else [[[0]]]
         self._element = create_lagrange_element(cell, degree) if self.dim else None
         #: Bound of ``|sum_a N_a v_a|`` on the facet for values ``|v_a| <= 1`` at its nodes, their Lebesgue constant.
-        self.lebesgue = (
-            {"point": 1.0, "interval": 5 / 4, "triangle": 5 / 3, "quadrilateral": 25 / 16}[cell] if degree > 1 else 1.0
-        )
-        # Newton is exact at once where the map is affine
+        self.lebesgue = {"interval": 5 / 4, "triangle": 5 / 3, "quadrilateral": 25 / 16}.get(cell, 1.0) if degree > 1 else 1.0
         self.affine = degree == 1 and cell in ("point", "interval", "triangle")
 
     def tabulate(self, xi: Array) -> Tabulated:
@@ -132,7 +129,7 @@ class FacetShape:
         return pieces
 
     def at_middle(self, n: int) -> Tabulated:
-        """Shape functions at the middles of n facets (a view: not to be changed)."""
+        """Shape functions at the middles of n facets (a read-only view)."""
         tab = self._at_middle
         return Tabulated(*(np.broadcast_to(values, (n, *values.shape[1:])) for values in (tab.N, tab.dN, tab.ddN)))
 
@@ -153,12 +150,9 @@ class FacetShape:
             return np.column_stack([1 - xi.sum(axis=1), xi])
         return np.column_stack([xi[:, 1], xi[:, 0], 1 - xi[:, 0], 1 - xi[:, 1]])
 
+    @cached_property
     def edges(self) -> list[tuple[FacetShape, Indices, Array, Array]]:
         """Boundary of the facet: per side its shape, its nodes in the facet, and the map ``xi = o + s @ D``."""
-        return self._edges
-
-    @cached_property
-    def _edges(self) -> list[tuple[FacetShape, Indices, Array, Array]]:
         if self.dim == 0:
             return []
         corners = facet_shape(self.cell, 1).nodes
@@ -183,7 +177,7 @@ def tangents(tab: Tabulated, x: Array) -> Array:
 
 
 def area_vectors(tab: Tabulated, x: Array) -> Array:
-    """Normals ``(n, gdim)`` in the sense of the facet's own parametrisation, as long as the facet is large."""
+    """Normals ``(n, gdim)`` in the sense of the parametrisation, whose lengths are the sizes of the facets."""
     return _across(tangents(tab, x))
 
 
@@ -193,7 +187,7 @@ def nodal_area_vectors(shape: FacetShape, x: Array) -> Array:
 
 
 def integrals(shape: FacetShape, x: Array, axisymmetric: bool = False) -> Array:
-    """Integrals of the shape functions over facets ``x (n, nn, gdim)``, of bodies of revolution over whole circles: ``(n, nn)``."""
+    """Integrals of the shape functions over facets ``x (n, nn, gdim)``, in axisymmetry over whole circles: ``(n, nn)``."""
     points, weights = quadrature_rule(shape.cell, 2 * shape.degree + 1)
     tab = shape.tabulate(points)
     area = weights * np.linalg.norm(_across(np.einsum("qaf,nag->nqfg", tab.dN, x)), axis=2)
@@ -208,7 +202,7 @@ def _across(t: Array) -> Array:
 
 
 def unit_normals(tab: Tabulated, x: Array) -> Array:
-    """Unit normals ``(n, gdim)`` in the sense of the facet's own parametrisation."""
+    """Unit normals ``(n, gdim)`` in the sense of the parametrisation."""
     n = area_vectors(tab, x)
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
@@ -216,15 +210,15 @@ def unit_normals(tab: Tabulated, x: Array) -> Array:
 def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -> tuple[Array, Array]:
     """Exact closest points of facets ``x (n, nn, gdim)`` to ``p (n, gdim)``: coordinates ``xi (n, fdim)``, squared distances ``(n,)``.
 
-    The stationary point inside the facet, found in at most so many Newton ``iterations``, is compared with the closest points of
-    its sides (recursively, down to the vertices); the nearest wins.
+    The stationary point inside the facet, by at most ``iterations`` steps of Newton's method, or the closest point of a side, whichever is
+    nearer; sides are treated likewise, down to the vertices.
     """
     if shape.dim == 0:
         return np.zeros((len(p), 0)), np.einsum("ng,ng->n", p - x[:, 0], p - x[:, 0])
     xi, d2 = _stationary_point(shape, x, p, iterations)
-    for side, nodes, o, D in shape.edges():
+    for side, nodes, o, D in shape.edges:
         s, s2 = closest_point(side, x[:, nodes], p, iterations)
-        # a side wins only when it is truly nearer: an inner point keeps its full parametrisation
+        # of equally near points the inner one, which has all coordinates
         nearer = s2 < d2
         xi[nearer] = (o + s @ D)[nearer]
         d2 = np.where(nearer, s2, d2)
@@ -232,7 +226,7 @@ def closest_point(shape: FacetShape, x: Array, p: Array, iterations: int = 20) -
 
 
 def beneath(shape: FacetShape, x: Array, xi: Array, places: Array) -> tuple[Array, Tabulated]:
-    """What lies under ``places (n, gdim)``, seen along the normal at ``xi (n, fdim)``: its coordinates, and the functions there.
+    """Points of facets below ``places (n, gdim)`` along the normal at ``xi (n, fdim)``: coordinates, and shape functions there.
 
     Facets ``x (n, nn, gdim)`` are continued past their sides.
     """
@@ -272,7 +266,7 @@ def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) ->
 
 
 def _nearest_sample(shape: FacetShape, x: Array, p: Array) -> Array:
-    """Where Newton starts: the middle, or the nearest of middle and nodes of a curved facet ``(n, fdim)``."""
+    """Initial guess: the middle, or the nearest of middle and nodes of a curved facet ``(n, fdim)``."""
     if shape.degree == 1:
         return np.tile(shape.middle, (len(p), 1))
     samples = np.concatenate([shape.middle[None], shape.nodes])
@@ -281,7 +275,7 @@ def _nearest_sample(shape: FacetShape, x: Array, p: Array) -> Array:
 
 
 def _descending(shape: FacetShape, x: Array, p: Array, xi: Array, step: Array) -> Array:
-    """The steps from ``xi``, halved a few times while they lead away from ``p``."""
+    """Steps from ``xi``, halved at most four times as long as they increase the distance from ``p``."""
     now = _squared_distance(shape, x, p, xi)
     for _ in range(4):
         worse = _squared_distance(shape, x, p, xi + step) > now * (1 + 1e-10) + np.finfo(float).tiny
@@ -292,6 +286,6 @@ def _descending(shape: FacetShape, x: Array, p: Array, xi: Array, step: Array) -
 
 
 def _squared_distance(shape: FacetShape, x: Array, p: Array, xi: Array) -> Array:
-    """Of points ``p (n, gdim)`` to their facets' points ``xi (n, fdim)``: ``(n,)``."""
+    """Squared distances ``(n,)`` of points ``p (n, gdim)`` from points ``xi (n, fdim)`` of their facets."""
     r = p - np.einsum("na,nag->ng", shape.functions(xi), x)
     return np.einsum("ng,ng->n", r, r)

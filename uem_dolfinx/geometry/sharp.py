@@ -36,7 +36,7 @@ class Edges(NamedTuple):
 
 def sharp_edges(facets: TargetFacets, cosine: float = SHARP_EDGE) -> Edges:
     """Edges between facets whose normals differ by more than the angle with this cosine (collective)."""
-    X, n_sides, g = facets.config.X[facets.dofs], len(facets.shape.edges()), facets.config.gdim
+    X, n_sides, g = facets.config.X[facets.dofs], len(facets.shape.edges), facets.config.gdim
     number = facets.first[facets.config.comm.rank] + np.arange(len(X))
     middle, normal = facets.middles(X)
     own = np.repeat(np.column_stack([np.ones(len(X)), normal, middle, number]), n_sides, axis=0)

@@ -1,9 +1,9 @@
-"""Cells of several kinds divided into simplices of the same order, so that all of a mesh are of one kind and fit each other.
+"""Division of cells of several kinds into simplices of the same order, which gives a conforming mesh with one kind of cell.
 
-Every cell is divided from its vertex with the smallest number: triangles or tetrahedra stand there on the sides that it is not on,
-and quadrilaterals of these are divided from their own smallest vertex. So cells that share a quadrilateral divide it by the same diagonal,
-[Dompierre, Labbé, Vallet and Camarero, How to subdivide pyramids, prisms and hexahedra into tetrahedra, 1999]. No node is added:
-diagonals of cells of order 2 have theirs in the middle of the quadrilateral or hexahedron.
+The simplices of a cell join its vertex of lowest number with the sides that do not contain it; quadrilaterals among these sides are divided
+from their own vertex of lowest number. Cells that share a quadrilateral therefore divide it by the same diagonal [Dompierre, Labbé, Vallet
+and Camarero, How to subdivide pyramids, prisms and hexahedra into tetrahedra, 1999]. No node is added: in cells of order 2 the middle node
+of a quadrilateral or hexahedron is the node of its diagonals.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SIMPLICES = {2: ("triangle", "triangle6"), 3: ("tetra", "tetra10")}
 
 
 def divided(found: Found, label: str) -> tuple[Found, dict[str, int]]:
-    """The mesh with simplices alone, and how many cells of each kind that was divided there were; sets and surfaces are kept.
+    """The mesh with simplices only, with its sets and surfaces, and the number of divided cells of each kind.
 
     Args:
         found: with complete cells.
@@ -50,7 +50,7 @@ def divided(found: Found, label: str) -> tuple[Found, dict[str, int]]:
         origin.append(of)
     if len(orders) > 1:
         raise MeshError(
-            f"the cells of {label} are of order 1 and of order 2: expected one, which the program that made them can give"
+            f"the cells of {label} are of order 1 and of order 2: expected one order, which the mesh generator can give"
         )
 
     def members(which: Sequence[Ints]) -> list[Ints]:
@@ -74,7 +74,7 @@ def _order(block: Block, label: str) -> int:
 
 
 def _simplices(block: Block, order: int) -> tuple[Ints, Ints]:
-    """Nodes of the simplices of all cells, and the cell that each is of."""
+    """Nodes of the simplices of all cells, and the cell of each simplex."""
     kind = KINDS[block.base]
     lowest = block.data[:, : kind.vertices].argmin(axis=1)
     parts, of = [], []
@@ -87,7 +87,7 @@ def _simplices(block: Block, order: int) -> tuple[Ints, Ints]:
                 parts.append(_nodes(kind, block.data[which[rows]], (*local, apex), order))
                 of.append(which[rows])
     data, cell = np.concatenate(parts), np.concatenate(of)
-    # collapsed cells name a vertex twice
+    # collapsed cells contain a vertex twice
     corners = np.sort(data[:, : block.dim + 1], axis=1)
     whole = (np.diff(corners, axis=1) > 0).all(axis=1)
     order_of = np.argsort(cell[whole], kind="stable")
@@ -127,20 +127,20 @@ def _middle(kind: Kind, ends: set[int]) -> int:
 
 
 def _triangles(rows: Ints) -> Ints:
-    """Facets by their vertices, quadrilaterals divided as cells divide them."""
+    """Facets by their vertices; quadrilaterals are divided in the same way as by cells."""
     if rows.shape[1] == 3:
         return rows
     return np.concatenate([rows[which][:, local] for which, local in _divisions(rows, (0, 1, 2, 3))])
 
 
 def _check(points: Array, data: Ints, cell: Ints, dim: int, label: str) -> None:
-    """Refuse simplices ``data`` that are inside out, as a whole or at a vertex, by the volumes of the cells that they are of."""
+    """Refuse simplices ``data`` that are inside out, as a whole or at a vertex, relative to the volumes of their cells."""
     x = points[data, :dim]
     volume = np.linalg.det(x[:, 1 : dim + 1] - x[:, :1])
     wrong = volume * np.bincount(cell, volume)[cell] <= 0.0
     ends = [set(edge) for edge in KINDS["tetra" if dim == 3 else "triangle"].edges]
     for k in range(dim + 1) if data.shape[1] > dim + 1 else ():
-        # tangents of the edges from a vertex, whose nodes in the middle bend them
+        # tangents at a vertex of edges that are curved by their middle nodes
         others = [j for j in range(dim + 1) if j != k]
         middle = [dim + 1 + ends.index({j, k}) for j in others]
         corner = np.linalg.det(4.0 * x[:, middle] - 3.0 * x[:, k, None] - x[:, others])

@@ -20,8 +20,7 @@ from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced
 
-#: Classes of bodies by the size of their facets, which differs by less than this factor in a class: there the order of the mesh's
-#: input tells who follows.
+#: Bodies whose facets differ less in size are equally fine; the order of the mesh's input then determines which body follows.
 #: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
 ALIKE_IN_SIZE = 1.5
 
@@ -35,12 +34,12 @@ class Skin(TargetFacets):
 
     Args:
         config: configuration of the displacement.
-        tag: of all surfaces.
+        tag: tag of all surfaces.
 
     Attributes:
         n_bodies: number of bodies of the mesh.
         body_of_node: body of each local node, numbered in the order of the bodies' first cells in the mesh's input ``(n_local,)``.
-        body: of each facet ``(m,)``.
+        body: body of each facet ``(m,)``.
         edges: neighbours and sharpness at each side of each facet.
         size: mean length of the sides of each body's facets, 0 for a body without facets ``(n_bodies,)``.
         extent: diagonal of each body's bounding box in the reference configuration ``(n_bodies,)``.
@@ -77,16 +76,16 @@ class Skin(TargetFacets):
         """Position of each body in the order; each body follows the later ones ``(n_bodies,)`` (collective).
 
         Args:
-            first: parts of bodies that come first, in this order; then the finer ones.
-            rigid: nodes on surfaces that move as rigid bodies ``(n_owned,)``, or None. Bodies with an entirely rigid surface come
-                last: as contactors, more than three of their nodes in 2D, or six in 3D, would be linearly dependent.
+            first: parts of bodies that come first, in this order; the other bodies follow, finer ones first.
+            rigid: mask of nodes that move as rigid bodies ``(n_owned,)``, or None. Bodies with an entirely rigid surface come last:
+                the equations of more than three contactors in 2D, or six in 3D, would be linearly dependent.
         """
         named = np.full(self.n_bodies, len(first))
         if rigid is not None:
             nodes = surface_nodes(self.config, self.tag)
-            gives_way = np.zeros(self.n_bodies, bool)
-            gives_way[self.body_of_node[nodes[~rigid[nodes]]]] = True
-            named[~reduced(self.config.comm, gives_way, op=MPI.LOR)] += 1
+            deformable = np.zeros(self.n_bodies, bool)
+            deformable[self.body_of_node[nodes[~rigid[nodes]]]] = True
+            named[~reduced(self.config.comm, deformable, op=MPI.LOR)] += 1
         for k, tag in reversed(list(enumerate(first))):
             named[self.bodies_of(tag)] = k
         with np.errstate(divide="ignore"):
@@ -97,9 +96,9 @@ class Skin(TargetFacets):
 
     def bodies_of(self, tag: Tag) -> Bools:
         """Bodies to which a part of the mesh belongs ``(n_bodies,)`` (collective)."""
-        told = np.zeros(self.n_bodies, bool)
-        told[self.body_of_node[surface_nodes(self.config, tag)]] = True
-        return np.asarray(reduced(self.config.comm, told, op=MPI.LOR))
+        found = np.zeros(self.n_bodies, bool)
+        found[self.body_of_node[surface_nodes(self.config, tag)]] = True
+        return np.asarray(reduced(self.config.comm, found, op=MPI.LOR))
 
     # -- sharp edges -----------------------------------------------------------------------------------------------------
 
@@ -118,13 +117,13 @@ class Skin(TargetFacets):
         """Facets of one smooth face that meet at nodes on sharp edges (first time: collective).
 
         Returns:
-            Facets and their nodes ``(k,)``, the exchange of these with the nodes' owners, and pairs of received facets with similar
-            reference normals, each facet also with itself.
+            Facets and their nodes ``(k,)``, their exchange with the owners of the nodes, and pairs of received facets with similar
+            reference normals; each facet also forms a pair with itself.
         """
         facet, node = np.nonzero(self.on_sides(self.edges.sharp)[self.dofs])
         exchange = Exchange.to(self.config.comm, self.config.owner_of(self.nodes[facet, node]))
-        drawn = unit(self._area_vectors(self.config.X[self.dofs]))[facet, node]
-        there, normal = exchange.send(self.nodes[facet, node], drawn)
+        reference = unit(self._area_vectors(self.config.X[self.dofs]))[facet, node]
+        there, normal = exchange.send(self.nodes[facet, node], reference)
         i, j = pairs_of_equals(there)
         alike = np.einsum("kg,kg->k", normal[i], normal[j]) > SHARP_EDGE
         return facet, node, exchange, i[alike], j[alike]
@@ -156,7 +155,7 @@ class Skin(TargetFacets):
 
     @cached_property
     def areas(self) -> Areas:
-        """Of the whole surface."""
+        """Areas of the whole surface."""
         return Areas(self.config, self.tag, self)
 
     def cones(self, nodes: Indices) -> Array:
@@ -166,8 +165,7 @@ class Skin(TargetFacets):
         contact force in any direction between the normals is then within 60 degrees of one of them.
         """
         config, g = self.config, self.config.gdim
-        drawn = self._area_vectors(config.X[self.dofs])
-        normals = np.stack([self.normals(), unit(drawn)], axis=2)
+        normals = np.stack([self.normals(), unit(self._area_vectors(config.X[self.dofs]))], axis=2)
         there, arrived = config.send_to_owners(self.nodes.ravel(), normals.reshape(-1, 2 * g))
         order = np.argsort(there, kind="stable")
         there, arrived = there[order], arrived[order]
@@ -180,10 +178,10 @@ class Skin(TargetFacets):
 
 
 def names_of_bodies(parts: dict[str, Bools], n: int) -> list[str]:
-    """Name of each body, one for each: that of its part, or "body 1", "body 2", ... in the order of the mesh's input.
+    """Name of each body: the name of its part, or "body 1", "body 2", ... in the order of the mesh's input.
 
     Args:
-        parts: whether each body belongs to the part of a name, ``(n,)``, the same on all ranks.
+        parts: for each name, the mask of bodies of this part ``(n,)``, the same on all ranks.
         n: number of bodies.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Archard's law of wear, as a function of arrays: the volume worn is proportional to the force along the normal and to the way of slip."""
+"""Archard's law of wear for arrays: the worn volume is proportional to the normal force and to the slip."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from uem_dolfinx.arrays import Array
 
 
 def worn_volume(k: Array, start: Array, end: Array) -> Array:
-    """Volume worn in a step: k times the mean, of its start and end, of force times way ``(n,)``.
+    """Worn volume of a step ``(n,)``: k times the mean of normal force times slip, with the forces at the start and at the end.
 
     Args:
-        k: coefficient of wear over hardness, one over a pressure ``(n,)``.
-        start: force along the normal at the start of the step times the way that it acts on, an energy; tension wears nothing ``(n,)``.
-        end: the same of the force at its end ``(n,)``.
+        k: wear coefficient over hardness, one over a pressure ``(n,)``.
+        start: normal force at the start of the step times the slip, an energy; tension causes no wear ``(n,)``.
+        end: normal force at the end times the slip ``(n,)``.
     """
     return np.asarray(0.5 * k * (np.maximum(start, 0.0) + np.maximum(end, 0.0)))

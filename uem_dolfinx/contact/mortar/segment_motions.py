@@ -1,4 +1,4 @@
-"""Motions of points of contactor facets past a target: as linear functions of both bodies' nodes, and across the target's sides."""
+"""Motions of contactor points relative to a target: as linear functions of the nodes of both bodies, and across sides of the target."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from uem_dolfinx.geometry.shapes import FacetShape, area_vectors
 
 @dataclass(frozen=True)
 class Motions:
-    """Motions of contactor points past the target, as linear functions of the nodes' displacements.
+    """Motions of contactor points relative to the target, as linear functions of the nodes' displacements.
 
     Attributes:
         phi: the contactor's shape functions ``(q, nc)``.
         N: the target's ``(q, nt)``.
-        part: gap over the size of the facet ``(q,)``.
-        turning: of its area vector ``(q, nc, gdim, gdim)``.
+        part: gap over the size of the contactor facet ``(q,)``.
+        turning: derivative of its area vector a by the displacements ``(q, nc, gdim, gdim)``.
     """
 
     phi: Array
@@ -56,21 +56,21 @@ class Sides:
     """Points on sides of target facets over contactor facets.
 
     Attributes:
-        pair: ascending ``(q,)``.
+        pair: number of the pair of facets, ascending ``(q,)``.
         xi: reference coordinates on the contactor's facets ``(q, fdim)``.
-        b: functions of the contactor's basis there ``(q, nc)``.
+        b: values of the contactor's basis functions ``(q, nc)``.
         N: the target's shape functions ``(q, nt)``.
         gap: ``(q,)``.
-        offset: of the gap ``(q,)``, or zero.
-        t: change of the gap with the place ``(q, gdim)``.
-        slope: of the gap outward across the side ``(q,)``.
-        outward: out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
-        motions: of the points past the target.
-        way: of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``.
-        ahead: along the side in that plane; zero in 2D ``(q, gdim)``.
-        shift: change of the target's shape functions on this way ``(q, nt)``.
-        cut: way along the side of the place where it leaves the contactor facet, per motion; zero elsewhere ``(q, gdim)``.
-        weight: of the quadrature, a length in 3D, and of axisymmetric bodies ``2 pi r`` ``(q,)``.
+        offset: part of the gap that is an offset ``(q,)``.
+        t: derivative of the gap by the position ``(q, gdim)``.
+        slope: derivative of the gap outward across the side ``(q,)``.
+        outward: direction out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
+        motions: motions of the points relative to the target.
+        way: displacement of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``.
+        ahead: direction along the side in that plane; zero in 2D ``(q, gdim)``.
+        shift: derivative of the target's shape functions along ``ahead`` ``(q, nt)``.
+        cut: displacement along the side, per motion, of the point where the side leaves the contactor facet; else zero ``(q, gdim)``.
+        weight: of the quadrature, a length in 3D; in axisymmetry ``2 pi r`` ``(q,)``.
         end: whether the target ends there ``(q,)``.
     """
 
@@ -92,11 +92,11 @@ class Sides:
     end: Bools
 
     def at_ends(self) -> Sides:
-        """Those where the target ends."""
+        """Points where the target ends."""
         return self._take(self.end)
 
     def between(self) -> Sides:
-        """Those between two facets."""
+        """Points between two target facets."""
         return self._take(~self.end)
 
     def _take(self, which: Bools) -> Sides:
@@ -105,18 +105,18 @@ class Sides:
 
 @dataclass(frozen=True)
 class SidePoints:
-    """Points on straight sides of target facets over contactor facets, in the planes of these.
+    """Points on straight sides of target facets over contactor facets, in the planes of the contactor facets.
 
     Attributes:
-        pair: ascending ``(q,)``.
-        at: places ``(q, fdim)``.
-        eta: on the target facets ``(q, fdim)``.
-        outward: out of the target facet ``(q, fdim)``.
-        ahead: along the side, zero in 2D ``(q, fdim)``.
-        stride: change of ``eta`` on this way ``(q, fdim)``.
+        pair: number of the pair of facets, ascending ``(q,)``.
+        at: positions ``(q, fdim)``.
+        eta: reference coordinates on the target facets ``(q, fdim)``.
+        outward: direction out of the target facet ``(q, fdim)``.
+        ahead: direction along the side, zero in 2D ``(q, fdim)``.
+        stride: derivative of ``eta`` along ``ahead`` ``(q, fdim)``.
         weight: of the quadrature, a length in 3D; 1 in 2D ``(q,)``.
-        cut: how far the place where the side leaves the contactor facet goes along the side where it moves, zero elsewhere ``(q, fdim)``.
-        corners: the side's, among those of the target facet ``(q, gdim - 1)``.
+        cut: as in ``Sides``, per motion in the plane ``(q, fdim)``.
+        corners: corners of the side, as numbers within the target facet ``(q, gdim - 1)``.
     """
 
     pair: Ints
@@ -134,9 +134,9 @@ def ends(own: Array, other: FacetShape, its: Array) -> SidePoints:
     """Ends of target facets over contactor facets in 2D.
 
     Args:
-        own: nodes of the contactor's facets in their planes ``(p, nc, 2)``.
-        other: shape of the target's.
-        its: their nodes ``(p, nt, 2)``.
+        own: nodes of the contactor facets in their planes ``(p, nc, 2)``.
+        other: shape of the target facets.
+        its: nodes of the target facets in these planes ``(p, nt, 2)``.
     """
     size, margin = own[:, 1, 0], SLIVER * own[:, 1, 0]
     pair, corner = np.nonzero((its[:, :2, 0] > margin[:, None]) & (its[:, :2, 0] < (size - margin)[:, None]))
@@ -147,19 +147,19 @@ def ends(own: Array, other: FacetShape, its: Array) -> SidePoints:
 
 
 def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bool = False) -> SidePoints:
-    """Quadrature points on the straight sides of target facets over contactor facets; as ``ends``.
+    """Quadrature points on the straight sides of target facets over contactor facets in 3D; other arguments as in ``ends``.
 
     Args:
-        shape: of the contactor's facets.
-        own: their nodes in their planes ``(p, nc, 3)``.
-        other: shape of the target's.
-        its: their nodes ``(p, nt, 3)``.
-        cuts: the places where sides leave contactor facets instead, with weight 1 at the end and -1 at the beginning.
+        shape: of the contactor facets.
+        own: ``(p, nc, 3)``.
+        other: shape of the target facets.
+        its: ``(p, nt, 3)``.
+        cuts: instead, points where sides leave contactor facets, with weight 1 at the end of a side and -1 at its beginning.
     """
     ring = np.array(other.ring)
     start, end = its[:, ring, :2], its[:, np.roll(ring, -1), :2]
     low, high = np.zeros(start.shape[:2]), np.ones(start.shape[:2])
-    # sides of the contactor facet that cut them off, -1 for none
+    # sides of the contactor facet that cut the target sides, -1 for none
     none: Ints = np.full(low.shape, -1, dtype=np.int64)
     cut_low, cut_high = none, none
     frame = own[:, shape.ring, :2]
@@ -168,18 +168,18 @@ def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bo
     for j in range(frame.shape[1]):
         corner, along = frame[:, None, j], borders[:, None, j]
         before, after = turn * cross(along, start - corner), turn * cross(along, end - corner)
-        # one that coincides with a side of the contactor facet is not over it
+        # a side that coincides with a side of the contactor facet is not over the facet
         least = SLIVER * np.einsum("pkf,pkf->pk", along, along)
-        comes, goes = (before <= least) & (after > least), (before > least) & (after <= least)
-        met = before / np.where(comes | goes, before - after, 1.0)
-        later, sooner = comes & (met > low), goes & (met < high)
-        low, cut_low = np.where(later, met, low), np.where(later, j, cut_low)
-        high, cut_high = np.where(sooner, met, high), np.where(sooner, j, cut_high)
+        enters, leaves = (before <= least) & (after > least), (before > least) & (after <= least)
+        crossing = before / np.where(enters | leaves, before - after, 1.0)
+        later, sooner = enters & (crossing > low), leaves & (crossing < high)
+        low, cut_low = np.where(later, crossing, low), np.where(later, j, cut_low)
+        high, cut_high = np.where(sooner, crossing, high), np.where(sooner, j, cut_high)
         high = np.where((before <= least) & (after <= least), -1.0, high)
     pair, side = np.nonzero(high > low)
     low, high = low[pair, side], high[pair, side]
     points, weights = side_rule(shape)
-    # parts of sides, weights there, and the sides of contactor facets where they leave these
+    # positions on sides, their weights, and the sides of contactor facets there
     part, first = low[:, None] + (high - low)[:, None] * points[:, 0], (high - low)[:, None] * weights
     border: Ints = np.zeros(part.shape, dtype=np.int64)
     if cuts:
@@ -206,27 +206,27 @@ def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bo
 
 
 def side_rule(shape: FacetShape) -> tuple[Array, Array]:
-    """Quadrature on sides over contactor facets of a ``shape`` in 3D; the one end that a side has in 2D."""
+    """Quadrature on sides over contactor facets of a ``shape`` in 3D; a single point in 2D."""
     if shape.dim == 1:
         return np.zeros((1, 0)), np.ones(1)
-    # bilinear functions are of degree 2 across
+    # bilinear functions have degree 2 along a line across
     return forms.quadrature_rule("interval", 2 * shape.degree * (2 if shape.cell == "quadrilateral" else 1) + 2)
 
 
 def outer(left: Array, right: Array) -> Array:
-    """Products of linear functions of the nodes ``(q, nn, gdim)``, each with its own: ``(q, nn gdim, nn gdim)``."""
+    """Outer products of linear functions of the nodes ``(q, nn, gdim)``, point by point: ``(q, nn gdim, nn gdim)``."""
     k = left.shape[1] * left.shape[2]
     return left.reshape(-1, k, 1) * right.reshape(-1, 1, k)
 
 
 def slopes(shape: FacetShape, y: Array, normal: Array, pair: Ints, eta: Array) -> Array:
-    """Changes of the gap with ``x - y`` at points ``eta (q, fdim)`` of target facets ``(q, gdim)``.
+    """Derivatives of the gap by ``x - y`` at points ``eta (q, fdim)`` of target facets ``(q, gdim)``.
 
     Args:
-        shape: of the target's facets.
+        shape: of the target facets.
         y: their nodes, pair by pair ``(k, nt, gdim)``.
-        normal: of the contactor's facets, pair by pair ``(k, gdim)``.
-        pair: of each point ``(q,)``.
+        normal: of the contactor facets, pair by pair ``(k, gdim)``.
+        pair: pair of each point ``(q,)``.
         eta: reference coordinates.
     """
     if shape.affine:
@@ -236,12 +236,12 @@ def slopes(shape: FacetShape, y: Array, normal: Array, pair: Ints, eta: Array) -
 
 
 def to_gap(across: Array, normal: Array) -> Array:
-    """Vectors along the target's normals ``across (q, gdim)``, of any length, whose product with the contactor's is -1."""
+    """Vectors along the target's normals ``across (q, gdim)``, of any length, with product -1 with the contactor's normals."""
     return -across / np.einsum("qg,qg->q", across, normal)[:, None]
 
 
 def dual_tangents(tangent: Array, n: Array) -> Array:
-    """Vectors across ``n (q, gdim)`` whose products with tangents ``(q, fdim, gdim)`` are 1 with the same and 0 with the other."""
+    """Vectors orthogonal to ``n (q, gdim)``, dual to the tangents ``(q, fdim, gdim)``."""
     if tangent.shape[1] == 1:
         across = np.stack([-n[:, 1], n[:, 0]], axis=1)[:, None]
     else:
@@ -255,7 +255,7 @@ def sum_of_products(pair: Ints, weight: Array, left: Array, right: Array, k: int
     Args:
         pair: of the points, ascending ``(q,)``.
         weight: ``(q,)``.
-        left: a linear function of the nodes each ``(q, nn, gdim)``.
+        left: linear functions of the nodes ``(q, nn, gdim)``.
         right: likewise.
         k: number of pairs.
     """
@@ -271,7 +271,7 @@ def sum_of_products(pair: Ints, weight: Array, left: Array, right: Array, k: int
 
 
 def ring_of(shape: FacetShape) -> Array:
-    """1 where a corner follows another around the facet, -1 where it goes before it ``(n_corners, n_corners)``."""
+    """1 where a corner follows another around the facet, -1 where it precedes it ``(n_corners, n_corners)``."""
     ring, n = shape.ring, len(shape.ring)
     out = np.zeros((n, n))
     out[ring, np.roll(ring, -1)] = 1.0
@@ -279,7 +279,7 @@ def ring_of(shape: FacetShape) -> Array:
 
 
 def skew(v: Array) -> Array:
-    """Matrices of the cross products with ``v (..., 3)`` from the left ``(..., 3, 3)``."""
+    """Matrices ``(..., 3, 3)`` of the cross products ``v x`` with ``v (..., 3)``."""
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return out - np.swapaxes(out, -1, -2)

@@ -79,7 +79,7 @@ def _shared_place(
     found, weights = np.zeros(k, bool), np.zeros((k, nn))
     dN, ddN = np.zeros((k, nn, d)), np.zeros((k, nn, d, d))
     x, beyond, past = first.x, np.zeros(points.shape), (first.beyond != 0).any(axis=1)
-    for side, nodes, _, _ in shape.edges():
+    for side, nodes, _, _ in shape.edges:
         i = np.flatnonzero((count == 2) & common[:, nodes].all(axis=1) & ~found)
         s, _ = closest_point(side, x[i][:, nodes], points[i])
         if d:

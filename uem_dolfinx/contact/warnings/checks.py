@@ -27,17 +27,17 @@ from uem_dolfinx.geometry.tags import Tag, locate_dofs
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree, reduced
 
-#: A contactor whose equation depends on others may be left inside the target by this part of the model's size.
+#: Largest penetration of contactors whose equations depend on other equations.
 #: [convention; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
 LEFT_OUT = 1e-6
-#: Surfaces that come nearer than their facets sag on more facets than this, in every direction, conform.
+#: Surfaces conform if their clearance is below the sag of the facets on more facets than this, in every direction.
 #: [convention; facets; test_warnings.py::test_surfaces_that_conform]
 CONFORMING = 4
-#: With mortar a contactor's node holds off all of its facets in their mean if their areas sum up to less than this, over the length of
-#: their vector sum: facets of a tip that meet at 39 degrees.
+#: One equation of mortar at a node is sufficient if the sum of the areas of its facets, over the length of the sum of their area vectors,
+#: is smaller; the facets of a tip of 39 degrees have this ratio.
 #: [convention; areas; test_warnings.py::test_slim_tips]
 SLIM = 3.0
-#: Contactors that have slid off the target's end are told of if they have more than this part of the surface in contact.
+#: A warning is given if more than this part of the surface in contact has slid off the end of the target.
 #: [convention; area; test_warnings.py::test_contactors_that_slip_off]
 SLIPPED = 0.05
 
@@ -75,9 +75,9 @@ def check_initial(pair: Interface) -> None:
 
 
 def check_prescribed(pair: Interface) -> None:
-    """Refuse an equilibrium in which a contactor is held inside the target by Dirichlet conditions or other contacts (collective).
+    """Refuse an equilibrium in which Dirichlet conditions or other contacts hold a contactor inside the target (collective).
 
-    Also a tied contactor held away from its tied position.
+    The same applies to a tied contactor that they hold away from its tied position.
 
     Raises:
         ConflictError: naming the deepest or farthest node of the first rank with such a node.
@@ -98,16 +98,16 @@ def check_prescribed(pair: Interface) -> None:
             )
             if pair.movable[i]
             else ConflictError(
-                f"{where} is prescribed to be {by}, where a Dirichlet condition or another contact fights the uniting equation and "
-                "neither body can give way: release the condition along the normal, or drop one of the contacts"
+                f"{where} is prescribed to be {by}: a Dirichlet condition or another contact contradicts this one, and neither body can "
+                "move there; release the condition along the normal, or drop one of the contacts"
             )
         )
-    torn = pair.torn()
-    if torn.max(initial=0.0) > LEFT_OUT * pair.config.size:
-        i = int(torn.argmax())
+    misfit = pair.torn()
+    if misfit.max(initial=0.0) > LEFT_OUT * pair.config.size:
+        i = int(misfit.argmax())
         error = ConflictError(
-            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is held {torn[i]:.4g} away from where it is tied, "
-            "by Dirichlet conditions or other contacts on both sides of the tie, and neither can give way: release one of them"
+            f"{pair.name}: the contactor at {pair.config.describe(int(pair.nodes[i]))} is held {misfit[i]:.4g} away from its tied position "
+            "by Dirichlet conditions or other contacts on both sides of the tie, and neither side can move: release one of them"
         )
     agree(pair.config.comm, error)
 
@@ -135,16 +135,16 @@ def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -
     off = reduced(config.comm, float(off), op=MPI.MAX)
     if off > TOUCHING * config.size:
         logger.warning(
-            "%s: a displacement of degree 1 makes straight facets of the curved ones of this mesh, up to %.3g off them: take one of "
-            "degree 2, uem.function_space(mesh, 2, (%d,))",
+            "%s: a displacement of degree 1 replaces the curved facets of this mesh by straight ones, up to %.3g away: use degree 2, "
+            "uem.function_space(mesh, 2, (%d,))",
             name, off, g,
         )  # fmt: skip
 
 
 def facet_curvatures(target: MeshTarget) -> Array:
-    """Curvature of the surface that each of this rank's facets approximates, minus the facet's own ``(m, gdim, gdim)``.
+    """Curvature of the surface that each of this rank's facets approximates, minus the curvature of the facet ``(m, gdim, gdim)``.
 
-    Positive for a convex target; zero at corners, and on facets that are curved themselves (collective).
+    Positive for a convex target; zero at corners and on curved facets (collective).
     """
     data = target.facets.current()
     normals = target.facets.normals()
@@ -159,7 +159,7 @@ def facet_curvatures(target: MeshTarget) -> Array:
 def sagging(pair: Interface) -> tuple[Bools, Array, Array]:
     """Contactors with clearance below the sag of the target's straight facets, the sags, and the clearances (collective).
 
-    ``(n,)`` each; no contactors for a rigid target.
+    ``(n,)`` each; all False for a rigid target.
     """
     target, p = pair.target, pair.projection
     if not isinstance(target, MeshTarget) or not isinstance(p, FacetProjection):
@@ -191,7 +191,7 @@ def warn_of_sagging_facets(pair: Interface) -> None:
 
 
 def warn_of_slim_tips(config: Configuration, name: str, surface: TargetFacets) -> None:
-    """Warn that mortar has one equation for both sides of a slim tip (collective).
+    """Warn that mortar has a single equation for both sides of a slim tip (collective).
 
     Args:
         config: configuration of the displacement.
@@ -201,7 +201,7 @@ def warn_of_slim_tips(config: Configuration, name: str, surface: TargetFacets) -
     comm, spread = config.comm, surface.spread()
     slim = surface.dofs[spread > SLIM]
     slim = slim[slim < config.n_owned]
-    (place,) = [p for p in comm.allgather(config.describe(int(slim.min())) if len(slim) else None) if p][:1] or [None]
+    place = next((p for p in comm.allgather(config.describe(int(slim.min())) if len(slim) else None) if p), None)
     if place is not None:
         logger.warning(
             "%s: the contactor's facets at %s meet at less than 40 degrees, and mortar has one equation for all of them, along their mean "
@@ -211,7 +211,7 @@ def warn_of_slim_tips(config: Configuration, name: str, surface: TargetFacets) -
 
 
 def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
-    """Warn of contactors that have slid off the end of the target, with their part of the surface (collective).
+    """Warn of contactors that have slid off the end of the target, and of their part of the surface (collective).
 
     Args:
         pair: in equilibrium.
@@ -224,9 +224,8 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
     p = pair.projection
     near = p.way_beyond < 0.5 * p.facet_size
     slipped = pair.off & ~before & near & (p.gap < 0.0)
-    lost, held, count = reduced(
-        pair.config.comm, np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])
-    )
+    sums = np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])
+    lost, held, count = reduced(pair.config.comm, sums)
     if lost <= SLIPPED * (lost + held):
         return False
     logger.warning(

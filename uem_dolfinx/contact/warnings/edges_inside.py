@@ -42,7 +42,7 @@ class EdgesInside:
         self._meeting = meeting
         self._own = SharpEdges(meeting.own)
         self._theirs = self._own if meeting.own is meeting.theirs else SharpEdges(meeting.theirs)
-        self._told = tuple(self._of(edges) for edges in (self._own, self._theirs))
+        self._keys = self._of(self._own), self._of(self._theirs)
 
     @property
     def any(self) -> bool:
@@ -69,7 +69,7 @@ class EdgesInside:
 
     def find(self) -> Crossing | None:
         """The deepest crossing, or None (collective)."""
-        return find_crossing(self._own, self._theirs, (self._told[0], self._told[1]), self._may_meet)
+        return find_crossing(self._own, self._theirs, self._keys, self._may_meet)
 
 
 def warn(name: str, found: Crossing) -> None:
@@ -77,5 +77,5 @@ def warn(name: str, found: Crossing) -> None:
     place = ", ".join(f"{x:.6g}" for x in found.place)
     logger.warning(
         "%s: sharp edges of two surfaces cross between their nodes, %.4g deep inside each other at (%s): contact acts at nodes of the "
-        "contactor alone, and nothing holds these edges apart; refine both edges there, or round them off", name, found.depth, place,
+        "contactor only, so that nothing separates these edges; refine both edges there, or round them off", name, found.depth, place,
     )  # fmt: skip

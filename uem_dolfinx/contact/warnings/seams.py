@@ -1,4 +1,4 @@
-"""Seams: contactors of one mortar contact whose displacements equations of users unite."""
+"""Warnings of equations of users between contactors of one mortar contact."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from uem_dolfinx.parallel import reduced
 def warn_of_seams(pairs: Sequence[Interface]) -> None:
     """Warn of equations between contactors of one mortar contact that do not give them one displacement (collective).
 
-    Each of these contactors has the row of the segments on its own side, although they move together. The force of both is right up to
-    the angle between the normals of the two sides; one contactor has all of it.
+    Each of these contactors has the equation of the segments on its own side, although they move together. The sum of their forces is
+    correct up to the angle between the normals of the two sides, but acts on one of them.
 
     Args:
         pairs: of all contacts.
@@ -33,8 +33,8 @@ def warn_of_seams(pairs: Sequence[Interface]) -> None:
         places = []
         for row, node in seams.others(*seams.groups(config, pair.nodes)):
             there = config.ask_owners(node, is_contactor)[:, 0] > 0
-            united = np.bincount(row[there]) > 1
-            places.append(config.ask_owners(node[there][united[row[there]]], config.X[: config.n_owned]))
+            several = np.bincount(row[there]) > 1
+            places.append(config.ask_owners(node[there][several[row[there]]], config.X[: config.n_owned]))
         at = np.concatenate(places)
         if not reduced(config.comm, len(at)):
             continue
@@ -43,7 +43,7 @@ def warn_of_seams(pairs: Sequence[Interface]) -> None:
         ends = (", ".join(f"{round(x / config.size, 9) * config.size + 0.0:.6g}" for x in end) for end in (low, high))
         logger.warning(
             "%s: equations tie contactors between (%s) and (%s) to each other, but do not give them one displacement, and "
-            "coupling='mortar' gives each the row of its own side: if there is contact, the pressure of one is too large by up to the "
-            "force of the other, and degree 2 may not converge; take coupling='node_to_surface', or put the seam where there is no contact",
+            "coupling='mortar' gives each the equation of its own side: in contact, the pressure of one is too large by up to the force of "
+            "the other, and degree 2 may not converge; take coupling='node_to_surface', or put the seam where there is no contact",
             pair.name, *ends,
         )  # fmt: skip

@@ -29,10 +29,10 @@ from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
 
-#: Corners that are no deeper in a facet than this part of its size lie on it.
+#: Corners that penetrate a facet by less than this part of its size lie on the facet.
 #: [convention; size of the facet; test_target_corners.py::test_what_is_told]
 ON_FACET = 1e-2
-#: Corners are told of where the contact lacks more than this part of its force by them: resultants are then wrong by a per cent or more.
+#: A warning is given if the missing force of corners exceeds this part of the contact force: resultants are wrong by one per cent or more.
 #: [convention; largest contact force so far; test_target_corners.py::test_what_is_told]
 LACKING = 0.1
 
@@ -46,7 +46,7 @@ class CornerInside:
         depth: of this corner, a length.
         part: depth over the size of the facet.
         lacking: missing force of all corners over the largest contact force so far.
-        both: whether contactors at corners or ends of their own surface are in contact, too, so that swapping the surfaces is no remedy.
+        both: whether contactors at corners or ends of their own surface are in contact, too; swapping the surfaces is then no remedy.
     """
 
     place: str
@@ -61,7 +61,7 @@ class CornerInside:
             remedy = "swap the two, or take coupling = 'mortar'"
         return (
             f"a convex corner of the target, at {self.place}, is {self.depth:.3g} inside a facet of the contactor, "
-            f"{100 * self.part:.2g} % of its size, between contactors, which do not see it: {remedy}"
+            f"{100 * self.part:.2g} % of its size, between contactors, where no condition prevents it: {remedy}"
         )
 
 
@@ -97,9 +97,8 @@ class TargetCorners:
                 sizes[id(tag)] = np.ptp(x, axis=1).max(initial=0.0), sides.min(initial=np.inf)
             if self.some[k]:
                 self.reach[k], self.smallest[k] = sizes[id(tag)]
-        extremes = np.concatenate([self.reach, -self.smallest])
-        config.comm.Allreduce(MPI.IN_PLACE, extremes, op=MPI.MAX)
-        self.reach, self.smallest = extremes[:n], -extremes[n:]
+        self.reach, lowest = reduced(config.comm, np.stack([self.reach, -self.smallest]), op=MPI.MAX)
+        self.smallest = -lowest
 
     @cached_property
     def surface(self) -> tuple[JoinedTarget | None, Ints]:
@@ -119,26 +118,26 @@ class TargetCorners:
         return JoinedTarget(JoinedFacets(self._config, surfaces), False, of_contact) if surfaces else None, of_contact
 
     @timed("corners of the target")
-    def find(self, stiffness: Array, asked: Bools) -> dict[int, CornerInside]:
+    def find(self, stiffness: Array, checked: Bools) -> dict[int, CornerInside]:
         """Penetrating corners in the current configuration, by number of the contact, for contacts in which they matter (collective).
 
         Args:
             stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, a force per length.
-            asked: contacts to be checked ``(n_pairs,)``.
+            checked: contacts to be checked ``(n_pairs,)``.
         """
         whole, config, comm, n = self.whole, self._config, self._config.comm, len(self.pairs)
-        asked = asked & self.some & ~np.array([pair.mutual for pair in self.pairs])
-        if not asked.any():
+        checked = checked & self.some & ~np.array([pair.mutual for pair in self.pairs])
+        if not checked.any():
             return {}
-        near, label = self._near(asked)
+        near, label = self._near(checked)
         pressing = sums_of_rows(whole.label, whole.trial.lam[:, None], n)[:, 0]
         some, force = reduced(comm, np.stack([np.bincount(label, minlength=n), pressing]))
         # separating bodies have small forces, so that the largest so far counts
-        self.largest[asked] = np.maximum(force, self.largest)[asked]
+        self.largest[checked] = np.maximum(force, self.largest)[checked]
         if not some.any():
             return {}
         # a corner near a contactor is no deeper than its distance from it
-        least = ON_FACET * float(self.smallest[asked].min())
+        least = ON_FACET * float(self.smallest[checked].min())
         away = 4.0 * config.size * np.arange(1, n + 1)
         places, points = (np.column_stack([x, away[k]]) for x, k in ((config.x[near], label), (whole.points, whole.label)))
         distance, _ = nearest_of(comm, places, points, least, np.zeros((len(points), 1)))
@@ -159,13 +158,11 @@ class TargetCorners:
             return {}
         stiffness = np.abs(stiffness)
         of_facet = config.ask_owners(p.nodes.ravel(), stiffness).reshape(*p.nodes.shape, config.gdim)
-        theirs, own = (
-            np.einsum("na,nag,ng->n", p.weights, of_facet, p.normal**2),
-            np.einsum("ng,ng->n", stiffness[near], p.normal**2),
-        )
+        theirs = np.einsum("na,nag,ng->n", p.weights, of_facet, p.normal**2)
+        own = np.einsum("ng,ng->n", stiffness[near], p.normal**2)
         both = np.where(inside, theirs * own / np.where(theirs + own > 0.0, theirs + own, 1.0), 0.0)
         lacking = reduced(comm, sums_of_rows(label, (both * depth)[:, None], n)[:, 0])
-        told = {}
+        harmful = {}
         for k in np.flatnonzero(lacking > LACKING * self.largest):
             which = np.flatnonzero(inside & (label == k))
             found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in which]
@@ -174,8 +171,8 @@ class TargetCorners:
             deepest = min(place for part, place, _ in everywhere if part >= (1.0 - TIED) * everywhere[0][0])
             size, place, deep = next(one for one in everywhere if one[1] == deepest)
             missing = lacking[k] / self.largest[k] if self.largest[k] > 0.0 else np.inf
-            told[int(k)] = CornerInside(place, deep, size, missing, self._at_own_corners(int(k)))
-        return told
+            harmful[int(k)] = CornerInside(place, deep, size, missing, self._at_own_corners(int(k)))
+        return harmful
 
     def _at_own_corners(self, k: int) -> bool:
         """Whether contactors of a contact at corners or ends of their own surface are active (collective)."""
@@ -183,16 +180,16 @@ class TargetCorners:
         corners = corner_nodes(config, facets_of(config, self._tags[k], "contactor"))
         return bool(reduced(config.comm, int(np.isin(pair.nodes[pair.trial.active], corners).sum())))
 
-    def _near(self, asked: Bools) -> tuple[Indices, Ints]:
+    def _near(self, checked: Bools) -> tuple[Indices, Ints]:
         """Corners inside the box around contactors within one facet size of the target, and their contacts (collective)."""
         whole, config, g = self.whole, self._config, self._config.gdim
         points, label = whole.points, whole.label
-        near = asked[label] & (np.linalg.norm(points - whole.projection.foot, axis=1) <= self.reach[label])
+        near = checked[label] & (np.linalg.norm(points - whole.projection.foot, axis=1) <= self.reach[label])
         bounds = np.full((len(self.pairs), 2 * g), -np.inf)
         np.maximum.at(bounds, label[near], np.column_stack([-points, points])[near])
         config.comm.Allreduce(MPI.IN_PLACE, bounds, op=MPI.MAX)
         x, reach, bounds = config.x[self.nodes], self.reach[self.label, None], bounds[self.label]
-        inside = asked[self.label] & ((x >= -bounds[:, :g] - reach) & (x <= bounds[:, g:] + reach)).all(axis=1)
+        inside = checked[self.label] & ((x >= -bounds[:, :g] - reach) & (x <= bounds[:, g:] + reach)).all(axis=1)
         return self.nodes[inside], self.label[inside]
 
 

@@ -45,7 +45,8 @@ class WatchedContact(ContactResults):
         self.taken, self._slipped, self._on = True, False, True
         #: The reported convex corner of the target, which reduces the contact force.
         self._corner: CornerInside | None = None
-        self._off_at_start = self.pair.off.copy()
+        #: Contactors that were past an end of the target at the start ``(n,)``.
+        self.off_at_start: Bools = self.pair.off.copy()
 
     def take_pair(self, pair: Interface) -> None:
         """Replace the interface of the contact."""
@@ -55,11 +56,11 @@ class WatchedContact(ContactResults):
 
     @property
     def on(self) -> bool:
-        """Whether it is switched on."""
+        """Whether the contact is switched on."""
         return self._on
 
     def switch(self, on: bool) -> None:
-        """Switch it on or off; the caller changes its pair."""
+        """Mark the contact as switched on or off; the caller changes its pair."""
         self._on = on
 
     @property
@@ -68,7 +69,7 @@ class WatchedContact(ContactResults):
         return self.pair.discretisation.at_feet and self.contactor.dim > 0
 
     def edges_that_meet(self) -> Meeting | None:
-        """Surfaces whose sharp edges may cross, in 3D; contacts with the same surfaces share them (collective)."""
+        """Surfaces whose sharp edges may cross, in 3D; shared by contacts of the same surfaces (collective)."""
         from uem_dolfinx.contact.warnings.edges_inside import Meeting
 
         if self.contactor.dim < 2 or self.tied is True or not isinstance(self.target, Tag):
@@ -91,17 +92,12 @@ class WatchedContact(ContactResults):
 
     @property
     def watches_ends(self) -> bool:
-        """Whether a warning of contactors that slide off the target's end is still possible."""
+        """Whether contactors may slide off an end of the target, and no warning of this has been given."""
         return not self._slipped and self.pair.target.n_nodes > 0
-
-    @property
-    def off_at_start(self) -> Bools:
-        """Contactors that were past an end of the target at the start ``(n,)``."""
-        return self._off_at_start
 
     def warn_of_ends(self) -> None:
         """Warn if many contactors have slid off the target's end (collective)."""
-        self._slipped = warn_of_slipped(self.pair, self._off_at_start | self.pair.tied, self._areas)
+        self._slipped = warn_of_slipped(self.pair, self.off_at_start | self.pair.tied, self._areas)
 
     def look_at_wear(self, before: PairState | None, stiffness: Array | None) -> None:
         """Warn, once, of too much wear in the step from the state ``before``; ``stiffness`` as in ``Watch.look`` (collective)."""
@@ -172,7 +168,8 @@ class Watch:
         for group in _by_interface(looked_at).values():
             self._look_at_ends(group)
         self._look_at_edges()
-        self._look_at_corners([c for c in looked_at if c.corner is None], stiffness)
+        for contact, corner in self.corners_inside([c for c in looked_at if c.corner is None], stiffness).items():
+            contact.note_corner(corner)
         for contact in looked_at:
             contact.look_at_wear(before.get(id(contact.pair)), stiffness)
 
@@ -200,20 +197,15 @@ class Watch:
             if some:
                 contact.warn_of_ends()
 
-    def _look_at_corners(self, contacts: Sequence[WatchedContact], stiffness: Array | None) -> None:
-        """Store and warn of a convex target corner inside the contactor, once for each contact (collective)."""
-        for contact, corner in self.corners_inside(contacts, stiffness).items():
-            contact.note_corner(corner)
-
     def corners_inside(self, contacts: Sequence[WatchedContact], stiffness: Array | None) -> dict[WatchedContact, CornerInside]:
         """Convex target corners inside contactors that reduce contact forces; ``stiffness`` as in ``look`` (collective)."""
         if stiffness is None:
             return {}
         found: dict[WatchedContact, CornerInside] = {}
-        asked = set(map(id, contacts))
+        checked = set(map(id, contacts))
         for corners, group in self._corners.values():
-            told = corners.find(stiffness, np.array([id(c) in asked for c in group]))
-            found |= {group[k]: corner for k, corner in told.items()}
+            of_group = corners.find(stiffness, np.array([id(c) in checked for c in group]))
+            found |= {group[k]: corner for k, corner in of_group.items()}
         return found
 
     def name_corner(self, stiffness: Array | None, error: UEMError) -> None:
@@ -236,9 +228,9 @@ def _warn_of_sagging_facets(group: Sequence[WatchedContact]) -> None:
     if len(some) > 1:
         near = np.bincount(whole.label[sagging(whole)[0]], minlength=len(some)) > 0
         some = reduced(whole.config.comm, near, op=MPI.LOR)
-    asked = {id(member) for member, one in zip(whole.members, some) if one}
+    near_pairs = {id(member) for member, one in zip(whole.members, some) if one}
     for contact in group:
-        if id(contact.pair) in asked:
+        if id(contact.pair) in near_pairs:
             warn_of_sagging_facets(contact.pair)
 
 
