@@ -77,7 +77,7 @@ def test_energy_of_the_rules():
 
 def test_words_of_schemes():
     for wrong in ({"beta": 0.0}, {"gamma": 0.4}):
-        with pytest.raises(ValueError, match="beta must be positive"):
+        with pytest.raises(ValueError, match="expected a positive beta"):
             uem.newmark(**wrong)
     with pytest.raises(ValueError, match="rho_inf = 1.5"):
         uem.generalised_alpha(1.5)

@@ -117,7 +117,7 @@ def test_which_part_is_the_displacement(comm):
     def law(displacement: Any) -> uem.VonMises:
         return uem.VonMises(w, E, NU, FY, H, kind="plane_strain", displacement=displacement)
 
-    refused(uem.SpaceError, "name the part that it is, as displacement=0", lambda: law(None))
+    refused(uem.SpaceError, "name its part of the mixed space, as displacement=0", lambda: law(None))
     refused(uem.SpaceError, ("displacement = 1", "take displacement=0"), lambda: law(1))
     refused(uem.InputError, "displacement = 2", lambda: law(2))
     other = uem.VonMises(w, E, NU, FY, H, kind="plane_strain", displacement=0)

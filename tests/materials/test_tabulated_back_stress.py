@@ -216,7 +216,7 @@ PAIRS = "pairs (plastic strain, back stress) from (0, 0)"
     [
         ({"kinematic_hardening": [(0.0, 0.0), (0.1, 1.0), (0.2, 0.5)]}, ("kinematic_hardening = [(0.0, 0.0)", PAIRS)),
         ({"kinematic_hardening": [(0.0, 0.0), (0.1, 1.0), (0.2, 3.0)]}, ("the slope rises from 10 to 20", "leave points out")),
-        ({"kinematic_hardening": [(0.0, 1.0), (0.1, 2.0)]}, (PAIRS, "the yield stress is at first")),
+        ({"kinematic_hardening": [(0.0, 1.0), (0.1, 2.0)]}, (PAIRS, "the initial yield stress")),
         ({"kinematic_hardening": [(0.0, 0.0), (0.1, -1.0)]}, (PAIRS,)),
         ({"kinematic_hardening": [(0.0, 0.0), (0.0, 1.0)]}, (PAIRS,)),
         ({"kinematic_hardening": [(0.0, 0.0), (0.1, np.nan)]}, (PAIRS,)),
@@ -225,7 +225,7 @@ PAIRS = "pairs (plastic strain, back stress) from (0, 0)"
         ({"kinematic_hardening": [("soft", 1.0)]}, ("kinematic_hardening = [('soft', 1.0)]", PAIRS)),
         ({"kinematic_hardening": "much"}, ("kinematic_hardening = 'much'", "0 or a positive number, or a table")),
         ({"kinematic_hardening": -1.0}, ("kinematic_hardening = -1.0", "0 or a positive number, or a table")),
-        ({"kinematic_hardening": TABLE, "hardening": H}, ("isotropic hardening beside a table", "hardening = 0")),
+        ({"kinematic_hardening": TABLE, "hardening": H}, ("isotropic hardening together with a table", "hardening = 0")),
         ({"kinematic_hardening": TABLE, "nu": 0.5, "kind": "plane_stress"}, ("nu = 0.5", "between -1 and 0.5")),
     ],
 )

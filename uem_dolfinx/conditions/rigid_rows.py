@@ -311,7 +311,7 @@ class RigidRows:
             """The motion ``(n_z,)`` with the momentum of fields ``(n_owned, gdim)`` and at the point, and its prescribed components."""
             momentum, sums = (reduced(comm, np.einsum("ngz,ng->z", X, field[nodes])) for X in (W, V))
             if added is not None:
-                momentum = momentum + scale * added.momentum_of(at, of_point)
+                momentum = momentum + scale * np.einsum("n,ngz,ng->z", added.masses, added.motions(at), of_point)
             momentum = momentum / size
             if alone:
                 # without mass of the nodes, the prescribed components follow from the added mass

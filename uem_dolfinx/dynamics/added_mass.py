@@ -5,8 +5,8 @@ and ``J_i = tr(I) / 2 - I_i``, the kinetic energy is, for every rotation,
 
     (m |p'|^2 + sum J_i |d_i'|^2) / 2
 
-In 2D one axis is sufficient, with J the inertia. The integrator acts on p and d_i in the same way as on displacements of nodes, which
-includes gyroscopic terms. The inertia forces are then a force at the point and a moment about it.
+In 2D one axis is sufficient, with J the inertia. The integrator treats p and d_i like displacements of nodes, which includes gyroscopic
+terms. The inertia forces are then a force at the point and a moment about it.
 """
 
 from __future__ import annotations
@@ -87,15 +87,11 @@ class AddedMass:
         V = self.motions(at)
         return np.asarray(np.einsum("n,ngz,ngy->zy", self.masses, V, V))
 
-    def momentum_of(self, at: Placement, rates: Array) -> Array:
-        """Momentum of these masses along the motions of the set ``(gdim + n_turns,)``, from rates ``(1 + n_axes, gdim)``."""
-        return np.asarray(np.einsum("n,ngz,ng->z", self.masses, self.motions(at), rates))
-
     @property
     def inert(self) -> Indices:
         """Owned nodes whose rigid motions have inertia by this mass (collective).
 
-        All nodes with enough inertia; only the node nearest to the point for a mass alone; no node for an inertia alone without bearing.
+        With sufficient inertia all nodes; with a mass only, the node nearest to the point; with an inertia only and no bearing, none.
         """
         s, n_axes = self.set, np.count_nonzero(self.masses[1:])
         if n_axes >= len(self._point) - 1 and (self.masses[0] > 0.0 or self._on_bearing):
@@ -134,8 +130,8 @@ class AddedMass:
 
     def rounding(self) -> float:
         """Norm of tangent times displacement, for the rounding of the loads (collective)."""
-        ways = np.append(np.linalg.norm(self._now()[0]), np.ones(len(self._axes)))[:, None]
-        return self.factor * float(np.linalg.norm(self._as_forces * self.masses[:, None] * ways))
+        sizes = np.append(np.linalg.norm(self._now()[0]), np.ones(len(self._axes)))[:, None]
+        return self.factor * float(np.linalg.norm(self._as_forces * self.masses[:, None] * sizes))
 
     def _inertia(self) -> Array:
         """Inertia forces, as in ``Dynamics`` (collective)."""
@@ -187,7 +183,7 @@ class AddedMass:
 
     @property
     def kept(self) -> list[Array]:
-        """All that the next step begins with."""
+        """Initial state of the next step."""
         return [self.places, self.velocity, self.acceleration, self.forces, self.carried]
 
     @kept.setter
@@ -199,7 +195,7 @@ class AddedMass:
 
     @property
     def pushed(self) -> Array:
-        """Forces of the coupling and of gravity on point and axes, when these were in equilibrium last ``(1 + n_axes, gdim)``."""
+        """Forces of the coupling and of gravity on point and axes in the last equilibrium ``(1 + n_axes, gdim)``."""
         return self.carried + self._weight
 
     @property

@@ -11,7 +11,7 @@ from uem_dolfinx.log import timed
 #: Components with less mass than this part of the largest have no acceleration at the start.
 #: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
 MASSLESS = 1e-12
-#: Residual that the first acceleration is solved to.
+#: Relative tolerance of the residual of the first acceleration.
 #: [bound; forces; -]
 ACCELERATED = 1e-13
 
@@ -37,8 +37,8 @@ def united_accelerations(
         M.axpy(1.0, added.PtAP(restriction.P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
     rhs = restriction.transpose(forces)
     diagonal = M.getDiagonal()
-    idle = diagonal.array_r <= MASSLESS * diagonal.max()[1]
-    diagonal.array[idle], rhs.array[idle] = 1.0, 0.0
+    massless = diagonal.array_r <= MASSLESS * diagonal.max()[1]
+    diagonal.array[massless], rhs.array[massless] = 1.0, 0.0
     M.setDiagonal(diagonal)
     ksp = PETSc.KSP().create(M.comm)
     ksp.setType("cg")

@@ -31,7 +31,7 @@ from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 if TYPE_CHECKING:
     from uem_dolfinx.dynamics.added_mass import AddedMass
 
-#: What a step in time begins with: time, length of the last step, energy given, displacement, fields, and masses at points.
+#: Initial state of a time step: time, length of the last step, energy of prescribed motion, displacement, fields, masses at points.
 DynamicsMemory = tuple[float, float, float, Array, list[Array], list[list[Array]]]
 
 
@@ -44,11 +44,11 @@ class Dynamics(given.Sealed):
         velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
         gravity: acceleration of free fall ``(gdim,)``; the weight of every node is its mass times gravity, so that free fall causes
             no strain.
-        damping: makes a form, linear in the test function, of the velocity as a UFL expression; it is added to the residual:
+        damping: function of the velocity, a UFL expression, that returns a form, linear in the test function, to add to the residual:
             ``lambda rate: eta * ufl.inner(ufl.sym(ufl.grad(rate)), ufl.sym(ufl.grad(v))) * ufl.dx``.
         contactors: ``"massless"`` moves the mass of the contactors to neighbouring nodes [UEM, 5], and the mass of the target nodes
-            below them in bodies with fine enough meshes, so that impact itself neither dissipates nor adds energy; ``"massy"`` does
-            not move it.
+            below them in bodies with sufficiently fine meshes, so that impact itself neither dissipates nor adds energy; ``"massy"``
+            does not move mass.
         time: at the start.
 
     Attributes:
@@ -80,11 +80,9 @@ class Dynamics(given.Sealed):
         contactors: str = "massless",
         time: float = 0.0,
     ):
-        given.kind(
-            "mass", mass, isinstance(mass, Mass), "a Mass", "make it by uem.lumped_mass(V, density) or uem.consistent_mass"
-        )
+        given.kind("mass", mass, isinstance(mass, Mass), "a Mass", "made by uem.lumped_mass(V, density) or uem.consistent_mass")
         given.kind("scheme", scheme, scheme is None or isinstance(scheme, Scheme), "a Scheme, as uem.newmark(), or None")
-        # a UFL form can be called as well
+        # UFL forms are callable, too
         makes = callable(damping) and not isinstance(damping, ufl.Form)
         given.kind(
             "damping", damping, damping is None or makes, "a function of the velocity that makes a form, or None",
@@ -123,10 +121,10 @@ class Dynamics(given.Sealed):
             )
         elif not config.numbers_as(self.mass.config.V):
             error = SpaceError(
-                "the mass is of another mesh than the displacement, or numbered otherwise, as a collapsed part of a mixed space: make it "
-                "with the function space of the displacement, or uem.function_space(mesh, degree, (gdim,))"
+                "the mass is of another mesh than the displacement, or has another numbering, as a collapsed part of a mixed space: make "
+                "it with the function space of the displacement, or uem.function_space(mesh, degree, (gdim,))"
             )
-        # on other ranks the sizes may agree by chance
+        # the sizes may agree by chance on other ranks
         agree(config.comm, error)
         self.velocity = fem.Function(config.V, name="velocity")
         self.acceleration = fem.Function(config.V, name="acceleration")
@@ -142,7 +140,7 @@ class Dynamics(given.Sealed):
             config.comm, "Dynamics", gravity=self._down, time=self.time, contactors=self.contactors, scheme=str(self.scheme)
         )
         self._copy_committed()
-        #: Inertia forces of the committed state, which balance all others.
+        #: Inertia forces of the committed state, which balance all other forces.
         self.forces = fem.Function(config.V)
         if self.damping is not None:
             self._rate, self.past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
@@ -166,12 +164,10 @@ class Dynamics(given.Sealed):
         elif v is not None:
             with agreed(self.config.comm):
                 expected = f"a Function of the displacement's space or {g} numbers"
-                given.kind(
-                    "velocity", v, not callable(v) and np.shape(v) == (g,), expected, "of a form of its own, interpolate one"
-                )
+                given.kind("velocity", v, not callable(v) and np.shape(v) == (g,), expected, "interpolate other velocities")
                 self.velocity.x.array.reshape(-1, g)[:] = given.vector("velocity", v, g)
         if not np.isfinite(compat.petsc_vector(self.velocity).norm()):
-            raise NotFiniteError("the velocity at the start holds NaN or infinity")
+            raise NotFiniteError("the velocity at the start contains NaN or infinity")
 
     @property
     def _displacement(self) -> Array:
@@ -212,7 +208,7 @@ class Dynamics(given.Sealed):
 
     def add(self, one: AddedMass) -> None:
         """Add a mass at a point that moves with the nodes of its coupling (collective)."""
-        one.start(self._of_nodes(self.velocity), self._down)
+        one.start(self.velocity.x.array[: self._n].reshape(-1, self.config.gdim), self._down)
         self.added.append(one)
 
     @property
@@ -222,10 +218,6 @@ class Dynamics(given.Sealed):
         for one in self.added:
             found[one.inert] = True
         return found
-
-    def _of_nodes(self, field: fem.Function) -> Array:
-        """Values of a field at the owned nodes ``(n_owned, gdim)``."""
-        return np.asarray(field.x.array[: self._n].reshape(-1, self.config.gdim))
 
     def _like(self, values: Array) -> PETSc.Vec:
         vector = self.mass.M.createVecRight()
@@ -247,10 +239,10 @@ class Dynamics(given.Sealed):
     def _prescribed(self) -> tuple[Array, Array, Array]:
         """Final velocity, mean acceleration, and acceleration in the equation of motion, of prescribed components.
 
-        Both integrators would repeat every jump of a prescribed velocity for ever: v(n+1) = 2 du/dt - v(n). So, with w the mean velocity
-        of the step, v(n+1) = w + dt/2 times the smaller of two slopes, the slope of w and the slope of v in the previous step, and 0 if
-        their signs differ. This is of second order for smooth motions, and equal to w after a jump, which is then an impact within the
-        step. Accelerations are differences of v, extrapolated to the time of the equation of motion.
+        Both integrators would repeat every jump of a prescribed velocity in all later steps: v(n+1) = 2 du/dt - v(n). Instead, with w the
+        mean velocity of the step, v(n+1) = w + dt/2 times the smaller of two slopes, of w and of v in the previous step, or 0 if their
+        signs differ. This is of second order for smooth motions, and equal to w after a jump, which is then an impact within the step.
+        Accelerations are differences of v, extrapolated to the time of the equation of motion.
         """
         i, dt, last = self.held, self.dt, self._last
         v, before = self._velocity[: self._n][i], self._acceleration[: self._n][i]
@@ -288,14 +280,14 @@ class Dynamics(given.Sealed):
             one.kept = own
 
     def restore(self) -> None:
-        """Leave a step that has begun; the forces are those of the committed state again."""
+        """Leave a step that has begun, with the forces of the committed state."""
         self._until, self.moving = self.time, False
         for one in self.added:
             one.leave()
 
     @contextmanager
     def without_inertia(self) -> Iterator[None]:
-        """A block in which the tangent has no mass and damping."""
+        """Context in which the tangent has no mass and no damping."""
         rate = None if self.damping is None else float(self._rate.value)
         factor, self.factor = self.factor, 0.0
         if rate is not None:
@@ -338,12 +330,11 @@ class Dynamics(given.Sealed):
     def accelerate(self, restriction: Restriction, F: PETSc.Vec, added: PETSc.Mat | None = None) -> None:
         """Initial acceleration with constraints P under F, the static residual minus weight: ``P'MP a = -P'F`` (collective).
 
-        ``added`` contains the masses at points, in addition to M. NotFiniteError for forces that are not finite, LinearSolveError for
-        negative masses.
+        ``added`` contains the masses at points. NotFiniteError for forces that are not finite, LinearSolveError for negative masses.
         """
         if not np.isfinite(F.norm()):
             raise NotFiniteError(
-                f"the forces at the start, time {self.time:.6g}, hold NaN or infinity: check loads, Dirichlet values and displacement"
+                f"the forces at the start, time {self.time:.6g}, contain NaN or infinity: check loads, Dirichlet values and displacement"
             )
         from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 
@@ -375,8 +366,8 @@ class Dynamics(given.Sealed):
             self.velocity.x.array[:n], self.acceleration.x.array[:n] = self.rates()
             self.mean_velocity.x.array[:n] = (self._displacement - self._u)[:n] / dt
             change = self.velocity.x.array[:n] - self._velocity[:n]
-            given = (self.mass.M * self._like(change)).array_r * (self._velocity[:n] + 0.5 * change)
-            self.driven += float(given[held].sum())
+            work = (self.mass.M * self._like(change)).array_r * (self._velocity[:n] + 0.5 * change)
+            self.driven += float(work[held].sum())
             for field in (self.forces, self.acceleration, self.velocity, self.mean_velocity):
                 field.x.scatter_forward()
             self.time, self._last, self.moving = self._until, dt, False

@@ -29,25 +29,25 @@ from uem_dolfinx.geometry.configuration import Configuration, configuration_of
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
-#: Row sums are the nodal masses of a body if none is less than this part of what diagonal scaling gives.
+#: Row sums are the nodal masses of a body if no sum is less than this part of the mass by diagonal scaling.
 #: [convention; nodal mass; test_thresholds_motion.py::test_small_row_sums]
 LEAST_ROW_SUM = 0.1
-#: Part of its own mass that a node loses at most when the contactors of its body become massless.
+#: Largest part of its mass that a node loses when the contactors of its body become massless.
 #: [convention; nodal mass; test_massless_contactors.py::test_refused_only_where_impossible]
 LARGEST_LOSS = 0.5
-#: Newton's method for the masses of the other nodes ends when the body's moments of mass are met to this part.
+#: Newton's method for the masses of the other nodes ends when the errors of the body's moments of mass are below this part.
 #: [bound; moments of mass; -]
 MOMENTS_MET = 1e-14
-#: Part of a body's moments of mass to which they have to be kept.
+#: Largest accepted error of a body's moments of mass.
 #: [convention; moments of mass; test_thresholds_motion.py::test_moments_of_a_thin_body]
 MOMENTS_KEPT = 1e-10
-#: When coordinates are scaled, a body spreads in every direction by this part of its largest spread at least.
+#: Smallest spread of a body in any direction that is used to scale coordinates.
 #: [convention; largest spread; test_thresholds_motion.py::test_moments_of_a_thin_body]
 THIN = 1e-4
-#: Steps of that method.
+#: Largest number of steps of Newton's method for the masses.
 #: [bound; steps; -]
 MOST_ITERATIONS = 60
-#: Halvings of each of them.
+#: Largest number of halvings of such a step.
 #: [bound; halvings; -]
 MOST_HALVINGS = 20
 
@@ -60,7 +60,7 @@ class Mass:
         M: with the layout and the block size of K.
         config: nodes and bodies; the displacement in it is not used.
         diagonal: whether M is diagonal.
-        density: of M, a UFL expression; None for masses given at nodes.
+        density: density of M, a UFL expression; None for masses given at nodes.
     """
 
     M: PETSc.Mat
@@ -88,7 +88,7 @@ class Mass:
 
     @property
     def centre(self) -> Array:
-        """Centre of all mass in the reference configuration, of all components ``(gdim,)``; NaN without mass (collective)."""
+        """Centre of the mass of all components in the reference configuration ``(gdim,)``; NaN without mass (collective)."""
         m = self._row_sums.sum(axis=1)
         sums = reduced(self.config.comm, np.append(m @ self._X, m.sum()))
         return self.config.of_circles(sums[:-1] / (sums[-1] if sums[-1] > 0 else np.nan))
@@ -243,7 +243,7 @@ class Mass:
         Args:
             here: mask of nodes of the body ``(n_owned,)``.
             needed: mask of nodes of any body that should be massless ``(n_owned,)``.
-            distance: of these from the surfaces that they may touch ``(n_owned,)``, or None.
+            distance: distances of these nodes from the surfaces that they may touch ``(n_owned,)``, or None.
         """
         heavy = self.of_nodes.any(axis=1) & here
         sums = [here.sum(), (heavy & needed).sum(), (heavy & ~needed).sum(), *self._X[here].sum(axis=0)]
@@ -278,8 +278,8 @@ class Mass:
             return ""
         count = reduced(comm, int((needed & (level <= levels[low])).sum()))
         return (
-            f"the {count} of them that are no farther than {levels[low] * unit:.4g} from what they may touch could be massless: make that "
-            "part of its surface the contactor, or "
+            f"the {count} contactors within {levels[low] * unit:.4g} of the surfaces that they may touch could be massless: make that part "
+            "of the surface the contactor, or "
         )
 
     @property
@@ -392,9 +392,7 @@ def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], n
         try:
             m = np.asarray(values, dtype=float)
         except (TypeError, ValueError):
-            raise MassError(
-                given.sentence("nodal masses", values, "numbers", "or a function of places that returns them")
-            ) from None
+            raise MassError(given.sentence("nodal masses", values, "numbers, or a function of positions")) from None
     if m.shape not in ((n,), (n, g)):
         error = MassError(f"nodal masses have shape {m.shape}: expected ({n},) or ({n}, {g}) for the {n} nodes of this rank")
     else:
@@ -402,7 +400,7 @@ def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], n
         wrong = np.flatnonzero(~((m >= 0) & np.isfinite(m)).all(axis=1))
         if len(wrong):
             where = config.describe(wrong[0])
-            error = MassError(f"the mass {m[wrong[0]]} of the node at {where} is negative or not finite: give masses from 0 up")
+            error = MassError(f"the mass {m[wrong[0]]} of the node at {where} is negative or not finite: give 0 or more")
     agree(config.comm, error)
     return Mass(_diagonal(config, m.ravel()), config, diagonal=True)
 

@@ -1,8 +1,8 @@
-"""Massless nodes of the contact surfaces: the contactors, and, if the rest of the body can take their mass, the nodes that they follow.
+"""Massless nodes of the contact surfaces: the contactors, and target nodes if the rest of their body can take the mass.
 
-A contactor and the nodes that it follows move together. Mass on either side would form an oscillator with the cells of both surfaces,
-of the highest frequency in the meshes. Impact excites it, nothing damps it, and the trapezoidal rule adds energy whenever the contact
-opens. Without mass on both sides the contact force is the static reaction of the gap.
+A contactor and the target nodes below it move together. Mass on either side and the cells of both surfaces would form an oscillator with
+the highest frequency of the meshes. Impact excites it, nothing damps it, and the trapezoidal rule adds energy whenever the contact opens.
+Without mass on both sides the contact force is the static reaction of the gap.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
     """The same bodies with massless contactors, and massless targets in bodies whose other nodes can take the mass (collective).
 
     Raises:
-        MassError: if the other nodes of a body cannot take the mass of its contactors, with the part that could be massless, if any.
+        MassError: if the other nodes of a body cannot take the mass of its contactors; it names the part that could be massless.
     """
     config, contacts = mass.config, [contact for contact in contacts if contact.tied is not True]
     of_all = [contact for contact in contacts if contact.of_all_surfaces]
@@ -57,8 +57,8 @@ def _warn_of_mass(mass: Mass, name: str, nodes: Indices) -> None:
     number = int(reduced(mass.config.comm, kept, op=MPI.LOR).sum())
     if number:
         logger.warning(
-            "%s: %d bodies are too thin, or their meshes too coarse, to do without the mass of their surfaces: impact will set these in "
-            "vibration; refine them to seven layers of cells of degree 1 from one side to the other, six with a lumped mass",
+            "%s: %d bodies are too thin, or their meshes too coarse, for massless surfaces: impact will excite vibrations of the surfaces; "
+            "refine the bodies to seven layers of cells of degree 1 from one side to the other, six with a lumped mass",
             name, number,
         )  # fmt: skip
 
@@ -84,12 +84,11 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
         sides = [_stiffness_per_area(config, tag, K) for tag in (contact.contactor, contact.target)]
         if sides[0] > sides[1] > 0.0:
             logger.warning(
-                "%s: the target's body is too thin, or its mesh too coarse, to do without the mass of its surface, and the contactor's "
-                "surface is stiffer (diagonal of K per area %.3g against %.3g): impact will set the target in vibration; swap contactor "
-                "and target, or refine the mesh behind the target",
-                contact.name,
-                *sides,
-            )
+                "%s: the target's body is too thin, or its mesh too coarse, for a massless surface, and the contactor's surface is stiffer "
+                "(diagonal of K per area %.3g against %.3g): impact will excite vibrations of the target; swap contactor and target, or "
+                "refine the mesh behind the target",
+                contact.name, *sides,
+            )  # fmt: skip
 
 
 def _followed(config: Configuration, contact: Contact) -> Bools:
@@ -104,7 +103,7 @@ def _distances(contactors: Indices, contacts: Sequence[Contact]) -> Array:
         whole.project()
     for contact in contacts:
         pair = contact.pair
-        # on a rigid surface the closest point is the contactor itself
+        # the closest point on a rigid surface is the contactor itself
         away = np.maximum(np.linalg.norm(pair.points - pair.projection.foot, axis=1), np.abs(pair.projection.gap))
         np.minimum.at(found, np.searchsorted(contactors, pair.nodes), away)
     return found

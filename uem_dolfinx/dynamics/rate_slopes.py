@@ -64,15 +64,15 @@ class RateSlopes:
         # for prescribed components the smaller of two slopes, zero if their signs differ
         some, less = slope * a[:n] > 0.0, np.abs(slope) < np.abs(a[:n])
         taken = (some & less) * 2.0 / (dt + last) * (mean - self._rows(w=1.0)) + (some & ~less) * self._rows(a=1.0)
-        v_led = mean + 0.5 * dt * taken
-        a_led = (v_led - self._rows(v=1.0)) / dt
+        v_held = mean + 0.5 * dt * taken
+        a_held = (v_held - self._rows(v=1.0)) / dt
         on = (0.5 - s.alpha_f) * 2.0 * dt / (dt + (last or dt))
-        led = a_led + on * (a_led - self._rows(a=1.0))
+        b_held = a_held + on * (a_held - self._rows(a=1.0))
         #: Derivatives of each result by du, v, a and w ``(4, n)``.
-        self._damped = np.where(held, v_led, v_end)
-        self._b = np.where(held, led, (1.0 - s.alpha_m) * a_end + s.alpha_m * self._rows(a=1.0))
+        self._damped = np.where(held, v_held, v_end)
+        self._b = np.where(held, b_held, (1.0 - s.alpha_m) * a_end + s.alpha_m * self._rows(a=1.0))
         self._v, self._w = np.where(massy, self._damped, mean), mean
-        self._a = np.where(massy, np.where(held, a_led, a_end), 0.0)
+        self._a = np.where(massy, np.where(held, a_held, a_end), 0.0)
         #: Derivatives by the displacement that are not in the tangent, zero for free components ``(n,)``.
         self._more_b = np.where(held, self._b[0] - (1.0 - s.alpha_m) * a_end[0], 0.0)
         self._more_damped = np.where(held, self._damped[0] - v_end[0], 0.0)
@@ -87,9 +87,8 @@ class RateSlopes:
 
     def _inertia(self, x: Array) -> Array:
         """Derivative by b, from derivatives ``x (n,)`` by the inertia forces (collective)."""
-        return self._dynamics.mass.times(x.reshape(-1, self._dynamics.config.gdim)).ravel() / (
-            1.0 - self._dynamics.scheme.alpha_f
-        )
+        d = self._dynamics
+        return d.mass.times(x.reshape(-1, d.config.gdim)).ravel() / (1.0 - d.scheme.alpha_f)
 
     def load(self) -> Array:
         """Derivative by the final displacement of the step, through its final state ``(n,)`` (collective)."""
@@ -109,10 +108,9 @@ class RateSlopes:
         """Compute derivatives by the initial state of the step; arguments as in ``beyond_tangent`` (collective)."""
         by, alpha = self.by, self._dynamics.scheme.alpha_f
         left = by.forces - a
-        du, v, accelerated, w = (
-            self._v * by.v + self._a * by.a + self._w * by.w + self._b * self._inertia(left) - self._damped * damped
-        )
-        self.by = ByState(-du, v, accelerated, w, -alpha / (1.0 - alpha) * left)
+        rates = self._v * by.v + self._a * by.a + self._w * by.w
+        du, v, a_start, w = rates + self._b * self._inertia(left) - self._damped * damped
+        self.by = ByState(-du, v, a_start, w, -alpha / (1.0 - alpha) * left)
 
     def by_acceleration(self) -> Array:
         """Derivative by the first acceleration ``(n,)``, also through the inertia forces (collective)."""

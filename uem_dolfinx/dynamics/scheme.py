@@ -35,13 +35,13 @@ class Scheme:
             given.number(name, getattr(self, name))
         if not (self.beta > 0.0 and self.gamma >= 0.5):
             raise InputError(
-                f"beta = {self.beta:g}, gamma = {self.gamma:g}: beta must be positive, since contact needs an implicit rule, and gamma "
-                "at least 1/2, since less makes every motion grow"
+                f"beta = {self.beta:g}, gamma = {self.gamma:g}: expected a positive beta, since contact needs an implicit method, and a "
+                "gamma of at least 1/2, since smaller values amplify all motions"
             )
         if not self.alpha_m <= self.alpha_f <= 0.5:
             raise InputError(
-                f"alpha_m = {self.alpha_m:g}, alpha_f = {self.alpha_f:g}: expected alpha_m <= alpha_f <= 1/2, since others make motions "
-                "grow; generalised_alpha(rho_inf) finds good ones"
+                f"alpha_m = {self.alpha_m:g}, alpha_f = {self.alpha_f:g}: expected alpha_m <= alpha_f <= 1/2, since other values amplify "
+                "motions; generalised_alpha(rho_inf) computes suitable values"
             )
 
     def factor(self, dt: float) -> float:
@@ -82,7 +82,7 @@ def generalised_alpha(rho_inf: float) -> Scheme:
     Raises:
         InputError, InputTypeError: if ``rho_inf`` is not between 0 and 1.
     """
-    kept = given.Range("the part of the fastest motions that a step keeps, from 0 to 1", lambda part: 0.0 <= part <= 1.0)
+    kept = given.Range("a spectral radius from 0 to 1", lambda part: 0.0 <= part <= 1.0)
     rho_inf = given.number("rho_inf", rho_inf, kept)
     alpha_m, alpha_f = (2 * rho_inf - 1) / (rho_inf + 1), rho_inf / (rho_inf + 1)
     return Scheme((1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f, alpha_m, alpha_f)

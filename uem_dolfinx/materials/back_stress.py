@@ -34,25 +34,25 @@ def kinematic_return(
         mu |dev ln(V_e)|^2 + 1/3 modulus |ln(V_p)|^2 + integral of the yield stress over peeq
 
     With ``C_p = F_p^T F_p`` these terms are distances of C_p from C, from 1 and from its committed value in the geometry of positive
-    tensors, in which such a sum is convex. It depends on C and C_p only, and so not on rotations, nor on the rotation in F_p. If all
-    principal axes agree it is the radial return.
+    tensors, in which such a sum is convex. The sum depends on C and C_p only, so not on rotations of the body or of F_p. If all
+    principal axes agree, this is the radial return.
 
     Arguments as in ``logarithmic_return``, and ``modulus (n,)``, the increase of the back stress in uniaxial tension per plastic strain.
-    Returns the same, with NaN also at points without convergence, and with the back stress's part in ``energy``.
+    Returns the same, with NaN also at points without convergence; ``energy`` includes the part of the back stress.
     """
     F, one = gradient + np.eye(3), np.eye(3)
     C, committed = F.transpose(0, 2, 1) @ F, one - 2 * to_tensors(plastic_strain)
     i = np.flatnonzero(np.isfinite(C).all(axis=(1, 2)))
     i = i[np.linalg.det(F[i]) > 0]
     points = _Points(i, C[i], committed[i], mu[i], modulus[i], peeq[i])
-    # F_p^-1 up to a rotation, on which nothing depends
+    # F_p^-1 up to a rotation, which has no effect
     L = np.linalg.cholesky(committed[i])
     driving = points.driving(L)
     q = np.sqrt(1.5) * np.linalg.norm(driving, axis=(1, 2))
     beyond = np.flatnonzero(q > (1 + ON_SURFACE) * curve.at(points.peeq, i)[0])
     points, q = points.some(beyond), q[beyond]
     dp = curve.increment(q, points.peeq, 3 * points.mu + points.modulus, points.i)
-    L = _settled(points, curve, L[beyond] @ _exponential(-1.5 * (dp / q)[:, None, None] * driving[beyond]))
+    L = _minimised(points, curve, L[beyond] @ _exponential(-1.5 * (dp / q)[:, None, None] * driving[beyond]))
     plastic, new, i = plastic_strain.copy(), peeq.copy(), points.i
     plastic[i] = to_components((one - L @ L.transpose(0, 2, 1)) / 2, plastic.shape[1])
     found = np.flatnonzero(np.isfinite(L).all(axis=(1, 2)))
@@ -66,7 +66,7 @@ def kinematic_return(
     return replace(flowed, energy=flowed.energy + modulus / 3 * (strains**2).sum(axis=1))
 
 
-def _settled(points: _Points, curve: YieldCurve, L: Array) -> Array:
+def _minimised(points: _Points, curve: YieldCurve, L: Array) -> Array:
     """Factors of ``C_p^-1`` at the minimum of the potential, by Newton's method; NaN without convergence ``(m, 3, 3)``.
 
     The iteration ends with steps below a part of the strains, or at rounding: small steps that no longer decrease.
@@ -93,9 +93,9 @@ class _Step:
 
     Attributes:
         slope: first derivative by further flow ``(m, 6)``.
-        hessian: second derivative, made regular by a term for the change of volume ``(m, 6, 6)``.
+        hessian: second derivative, regularised by a term for the change of volume ``(m, 6, 6)``.
         peeq: equivalent plastic strain ``(m,)``.
-        size: of the strains ``(m,)``.
+        size: norm of the strains ``(m,)``.
     """
 
     slope: Array
@@ -140,8 +140,9 @@ class _Points:
 
     def driving(self, L: Array) -> Array:
         """Deviator of the stress minus the back stress ``(m, 3, 3)``."""
-        E, A = self._elastic(L), self._plastic(L, np.eye(3))
-        return 2 * self.mu[:, None, None] * _deviator(E.tensor) - 2 / 3 * self.modulus[:, None, None] * A.tensor
+        E, A = self._elastic(L).tensor, self._plastic(L, np.eye(3)).tensor
+        deviator = E - np.trace(E, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+        return 2 * self.mu[:, None, None] * deviator - 2 / 3 * self.modulus[:, None, None] * A
 
     def step(self, L: Array, curve: YieldCurve) -> _Step:
         """Derivatives of the potential by flow from L."""
@@ -209,14 +210,10 @@ class _Strain:
         return (basis * weights[:, None, :]) @ basis.transpose(0, 2, 1)
 
 
-#: Projections of the components of symmetric tensors onto the volume's part and onto deviators.
+#: Projections of the components of symmetric tensors onto the volumetric part and onto deviators.
 #: [format; components; -]
 _VOLUME = np.outer([1, 1, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0]) / 3
 _NO_VOLUME = np.eye(6) - _VOLUME
-
-
-def _deviator(A: Array) -> Array:
-    return A - np.trace(A, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
 
 
 def _exponential(A: Array) -> Array:

@@ -25,17 +25,14 @@ SAME_SLOPE = 1e-9
 
 @dataclass(frozen=True)
 class BackTable:
-    """Back stress over the plastic strain in uniaxial tension, both ``(j,)`` from 0: straight lines, and a constant beyond the last point.
-
-    ``slopes (j,)`` are the slopes after each point, and decrease.
-    """
+    """Back stress over the plastic strain in uniaxial tension, both ``(j,)`` from 0: linear between points, constant after the last."""
 
     strains: Array
     stresses: Array
 
     @property
     def slopes(self) -> Array:
-        """Slopes after each point."""
+        """Slopes after each point ``(j,)``, which decrease."""
         return np.append(np.diff(self.stresses) / np.diff(self.strains), 0.0)
 
     @staticmethod
@@ -48,17 +45,17 @@ class BackTable:
         expected = "pairs (plastic strain, back stress) from (0, 0), strains rising, stresses not falling, slopes not rising"
         strains, stresses = read_pairs("kinematic_hardening", points, expected)
         if len(strains) < 2 or stresses[0] != 0:
-            remedy = "the back stress begins at 0; what the yield stress is at first is yield_stress"
+            remedy = "the back stress starts at 0; the initial yield stress is yield_stress"
             raise InputError(given.sentence("kinematic_hardening", points, expected, remedy))
         table = BackTable(strains, stresses)
-        before, behind = table.slopes[:-1], table.slopes[1:]
-        rising = np.flatnonzero(behind > (1 + SAME_SLOPE) * before)
+        before, after = table.slopes[:-1], table.slopes[1:]
+        rising = np.flatnonzero(after > (1 + SAME_SLOPE) * before)
         if len(rising):
             i = rising[0]
-            why = f"behind the plastic strain {strains[i + 1]:g} the slope rises from {before[i]:g} to {behind[i]:g}"
+            why = f"beyond the plastic strain {strains[i + 1]:g} the slope rises from {before[i]:g} to {after[i]:g}"
             remedy = f"{why}: leave points out, or put that part of the hardening into a table as yield_stress"
             raise InputError(given.sentence("kinematic_hardening", points, expected, remedy))
-        kept = np.append(True, behind < (1 - SAME_SLOPE) * before)
+        kept = np.append(True, after < (1 - SAME_SLOPE) * before)
         return BackTable(strains[kept], stresses[kept])
 
 
@@ -66,14 +63,14 @@ class BackTable:
 class Layers:
     """j layers at each of n points. Arrays of layers have n j rows, with the layers of one point one after another.
 
-    Layers have the elasticity of the body and, since flow is isochoric, its pressure. Their deviators in uniaxial tension are parallel:
-    with the yield stress Y layer i yields at the deviatoric strain ``p_i + (Y + X_i) / (3 mu)``, where the tabulated curve ``Y + X(p)``
-    has its i-th bend. The slope over this strain is ``3 mu`` times the weights of all layers that are still elastic, so that
+    Layers have the elasticity of the body and, since flow is isochoric, its pressure. Their deviators in uniaxial tension are parallel.
+    With the yield stress Y layer i yields at the deviatoric strain ``p_i + (Y + X_i) / (3 mu)`` of the i-th bend of the tabulated curve
+    ``Y + X(p)``. The slope over this strain is ``3 mu`` times the weights of all layers that are still elastic, so that
 
-        yield stress i = Y + X_i + 3 mu p_i,    sum of the weights up to i = 3 mu / (3 mu + slope behind i).
+        yield stress i = Y + X_i + 3 mu p_i,    sum of the weights up to i = 3 mu / (3 mu + slope after i).
 
     Attributes:
-        weights: parts of the body, whose sum is 1 ``(n, j)``.
+        weights: fractions of the body, of sum 1 ``(n, j)``.
         curve: yield stresses ``(n j,)``.
     """
 
@@ -108,20 +105,16 @@ class Layers:
         """Return of all layers in finite strain: their history ``(n j, k)`` and ``(n j,)``, and means for the body."""
         mu, gradient = self.repeat(mu), self.repeat(gradient)
         each = logarithmic_return(gradient, plastic_strain, peeq, mu, self.curve, components)
-        stress, piola, tangent, energy = (
-            self.mean(values) for values in (each.stress, each.first_piola, each.tangent, each.energy)
-        )
+        stress, piola, tangent, energy = (self.mean(v) for v in (each.stress, each.first_piola, each.tangent, each.energy))
         return Flowed(stress, piola, tangent, each.plastic_strain, each.peeq, energy)
 
     def radial_return(self, strain: Array, plastic_strain: Array, peeq: Array, mu: Array) -> Returned:
         """Return of all layers: their history ``(n j, k)`` and ``(n j,)``, j vectors m, and means for the body."""
         mu, none = self.repeat(mu), np.zeros_like(peeq)
         each = radial_return(self.repeat(strain), plastic_strain, peeq, mu, self.curve.yield_stress, none, none)
-        m = np.sqrt(self.weights).reshape(-1, 1) * each.m
+        m = (np.sqrt(self.weights).reshape(-1, 1) * each.m).reshape(len(strain), self.count * strain.shape[1])
         stress, a, c, energy = (self.mean(values) for values in (each.stress, each.a, each.c, each.energy))
-        return Returned(
-            stress, each.plastic_strain, each.peeq, a, c, m.reshape(len(strain), self.count * strain.shape[1]), energy
-        )
+        return Returned(stress, each.plastic_strain, each.peeq, a, c, m, energy)
 
     def plane_stress_return(self, strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array) -> Returned:
         """Return of all layers with the same out-of-plane strain, for which the body's out-of-plane stress is zero.
@@ -149,8 +142,8 @@ class Layers:
             each = self.radial_return(full, plastic_strain, peeq, mu)
             pressure, c, m = bulk * full[:, :3].sum(axis=1), each.c + bulk, each.m.reshape(len(full), self.count, 4)
             stiff = each.a + c - (m[:, :, 2] ** 2).sum(axis=1)
-            settled = np.abs(step) <= RETURNED * np.linalg.norm(full, axis=1)
-            if settled.all():
+            converged = np.abs(step) <= RETURNED * np.linalg.norm(full, axis=1)
+            if converged.all():
                 break
             across, now = each.stress[:, 2] + pressure, full[:, 2]
             low, high = np.where(across < 0, now, low), np.where(across > 0, now, high)
@@ -158,7 +151,7 @@ class Layers:
             i = np.flatnonzero((now + step < low) | (now + step > high))
             step[i] = (low[i] + high[i]) / 2 - now[i]
         stress = each.stress[:, plane] + pressure[:, None] * one
-        stress[~settled] = np.nan
+        stress[~converged] = np.nan
         # condensation of the out-of-plane strain: derivative of the stress in the plane by it
         mixed = c[:, None] * one - np.einsum("nj,njk->nk", m[:, :, 2], m[:, :, plane])
         last = mixed / np.sqrt(stiff)[:, None]

@@ -159,7 +159,7 @@ class VonMises(given.Sealed):
             raise SpaceError(
                 f"plasticity needs a displacement in a vector Lagrange space of size {gdim} and degree 1 or 2 on a mesh of "
                 f"dimension {gdim}: got size {size}, degree {degree}, dimension {self.mesh.topology.dim}"
-                + ("; of a mixed space name the part that it is, as displacement=0" if compat.is_mixed(V) else "")
+                + ("; name its part of the mixed space, as displacement=0" if compat.is_mixed(V) else "")
             )
         return degree
 
@@ -214,8 +214,8 @@ class VonMises(given.Sealed):
         table, curve, error = BackTable.read(points), self._curve, None
         if not isinstance(curve, Linear) or curve.slope.any():
             error = InputError(
-                "isotropic hardening beside a table of back stresses: expected hardening = 0 and yield_stress as a number or a DG0 "
-                "Function; or give kinematic_hardening as a number, which goes with any isotropic hardening"
+                "isotropic hardening together with a table of back stresses: expected hardening = 0 and yield_stress as a number or a DG0 "
+                "Function; or give kinematic_hardening as a number, which any isotropic hardening can be combined with"
             )
         agree(self.comm, error)
         self._layers = Layers.of(table, curve.at(np.zeros_like(self._mu), np.arange(len(self._mu)))[0], self._mu)

@@ -116,10 +116,9 @@ class Actions:
         """Collect forces and springs at points (collective)."""
         points = self.problem.bodies.points
         for one, nodes in points.parts if points is not None else ():
-            force, stiffness = one.force_and_stiffness(self.gdim)
-            at = self.config.X[nodes]
-            vectors = np.broadcast_to(force if stiffness is None else np.diag(stiffness), at.shape)
-            self.act(*(("load", "point load") if stiffness is None else ("spring", "spring")), at, vectors)
+            (force, k), at = one.force_and_stiffness(self.gdim), self.config.X[nodes]
+            kind, name, vector = ("load", "point load", force) if k is None else ("spring", "spring", np.diag(k))
+            self.act(kind, name, at, np.broadcast_to(vector, at.shape))
 
     def bodies(self, loads: tuple[Array, Array]) -> None:
         """Collect loads on surfaces and body loads ``(n_owned, gdim)`` each, gravity and velocities of bodies (collective)."""
@@ -137,9 +136,9 @@ class Actions:
         number = body_sums(self.comm, np.ones(n), label, count)[:, None]
         middle = body_sums(self.comm, config.X[:n], label, count) / number
         total = config.of_circles(body_sums(self.comm, loads[1], label, count))
-        told = EVEN * body_sums(self.comm, np.abs(loads[1]).sum(axis=1), label, count)
+        least = EVEN * body_sums(self.comm, np.abs(loads[1]).sum(axis=1), label, count)
         here = slice(None) if self.comm.rank == 0 else slice(0)
-        acts = np.linalg.norm(total, axis=1) > told
+        acts = np.linalg.norm(total, axis=1) > least
         self.act("body load", "body force", middle[acts][here], total[acts][here])
         if dynamics is None:
             return
@@ -148,9 +147,8 @@ class Actions:
         velocity = dynamics.velocity.x.array.reshape(-1, self.gdim)[:n]
         fastest = reduced(self.comm, np.abs(velocity).max(initial=0.0), op=MPI.MAX)
         mean = body_sums(self.comm, velocity, label, count) / number
-        varies = (
-            body_sums(self.comm, (np.abs(velocity - mean[label]).max(axis=1) > EVEN * fastest).astype(float), label, count) > 0
-        )
+        off_mean = np.abs(velocity - mean[label]).max(axis=1) > EVEN * fastest
+        varies = body_sums(self.comm, off_mean.astype(float), label, count) > 0
         moves = (np.abs(mean).max(axis=1) > EVEN * fastest) & ~varies
         self.act("velocity", "velocity", middle[moves][here], mean[moves][here])
         some = varies[label] & (outward != 0).any(axis=1)

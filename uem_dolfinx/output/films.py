@@ -1,4 +1,4 @@
-"""Films of runs: data are collected at each step, and drawn at the end of the run."""
+"""Films of runs: data are collected at each step and drawn at the end of the run."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _prepare(path: Path) -> None:
     from matplotlib.animation import FFMpegWriter
 
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
-        raise MissingBackendError(f"the film {path} needs ffmpeg, which is not there: install it, or write a .gif")
+        raise MissingBackendError(f"the film {path} needs ffmpeg, which is missing: install it, or write a .gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab"):
         pass

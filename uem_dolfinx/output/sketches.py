@@ -88,7 +88,7 @@ class Sketch:
         flat = len(ends) == 2
         self.tick, self.unit = (0.025 if flat else 0.032) * self.size, 0.11 * self.size
         #: Distance between symbols of one kind, in these lengths.
-        self.apart = 2.0 if flat else 3.5
+        self.spacing = 2.0 if flat else 3.5
         #: Whether all contacts share one pair of colours, because there are too many.
         self.many = 1 + max((s.pair for s in found.surfaces), default=0) > len(PAIRS)
         #: Colours of drawn items by kind of symbol and name.
@@ -127,9 +127,9 @@ class Sketch:
         for one in self.acting("held"):
             for c, axis in enumerate(np.eye(one.at.shape[1])):
                 which = np.flatnonzero(one.vectors[:, c] > 0)
-                which = which[thinned(one.at[which], self.apart * self.tick)]
+                which = which[thinned(one.at[which], self.spacing * self.tick)]
                 if len(which):
-                    # from outside
+                    # symbols are outside of the body
                     side = np.where(one.outward[which, c] > EVEN, -1.0, 1.0)
                     self._name("held", "held component", COLOURS["held"])
                     yield one.at[which], side[:, None] * axis
@@ -137,8 +137,7 @@ class Sketch:
     def _arrows(self) -> Iterator[tuple[str, Array, Array]]:
         """Colours, tails and arrows ``(n, gdim)``."""
         largest = {
-            kind: max((float(np.linalg.norm(one.vectors, axis=1).max()) for one in self.acting(kind)), default=1.0)
-            for kind in SIZED
+            kind: max((np.linalg.norm(one.vectors, axis=1).max() for one in self.acting(kind)), default=1.0) for kind in SIZED
         }
         for one in self.acting("prescribed", "load", "body load", "velocity"):
             size = np.linalg.norm(one.vectors, axis=1)
@@ -146,23 +145,20 @@ class Sketch:
             # arrows along a surface would overlap
             along = np.abs(np.einsum("ng,ng->n", one.vectors[shown], one.outward[shown])).sum() < 0.5 * size[shown].sum()
             along &= one.outward[shown].any()
-            shown = shown[thinned(one.at[shown], (1.3 if along else 0.35 * self.apart) * self.unit)]
+            shown = shown[thinned(one.at[shown], (1.3 if along else 0.35 * self.spacing) * self.unit)]
             length = size[shown] / largest[one.kind] if one.kind in SIZED and one.name != "gravity" else np.ones(len(shown))
-            way = self.unit * (length / size[shown])[:, None] * one.vectors[shown]
-            # arrows that push end at the surface
-            pushes = np.einsum("ng,ng->n", way, one.outward[shown]) < -EVEN * self.unit
+            vectors = self.unit * (length / size[shown])[:, None] * one.vectors[shown]
+            # the tips of arrows towards the body are on the surface
+            pushes = np.einsum("ng,ng->n", vectors, one.outward[shown]) < -EVEN * self.unit
             colour = self._name("arrow", one.name, COLOURS[one.kind])
-            yield colour, one.at[shown] - np.where(pushes[:, None], way, 0.0), way
+            yield colour, one.at[shown] - np.where(pushes[:, None], vectors, 0.0), vectors
         for rigid in self.found.rigid:
             if (length := np.linalg.norm(rigid.way)) > EVEN * self.size:
-                yield (
-                    self._name("arrow", "motion of a rigid surface", COLOURS["prescribed"]),
-                    rigid.at[None],
-                    self.unit / length * rigid.way[None],
-                )
+                colour = self._name("arrow", "motion of a rigid surface", COLOURS["prescribed"])
+                yield colour, rigid.at[None], self.unit / length * rigid.way[None]
         for place, vector, name in self.look.arrows:
-            way = self.unit / np.linalg.norm(vector) * vector
-            yield self._name("arrow", name, COLOURS["own"]), place[None], way[None]
+            scaled = self.unit / np.linalg.norm(vector) * vector
+            yield self._name("arrow", name, COLOURS["own"]), place[None], scaled[None]
 
     def legend(self, ax: Any, tall: bool) -> None:
         """Draw the legend to the right of a ``tall`` picture, otherwise below the picture."""
@@ -170,9 +166,11 @@ class Sketch:
         from matplotlib.patches import Patch
 
         handles, flat = [], self.found.cells.shape[-1] == 2
+        markers = {"held": "^", "arrow": r"$\rightarrow$", "turn": r"$\circlearrowleft$", "arm": "P", "value": "s"}
         named = sorted(self.names.items(), key=lambda item: FIRST.index(item[0][0]) if item[0][0] in FIRST else len(FIRST))
         for (kind, name), colour in named:
-            line: dict[str, Any] = {"color": colour, "label": name, "linestyle": "none", "markersize": 7}
+            size = 13 if kind in ("arrow", "turn") else 7
+            line: dict[str, Any] = {"color": colour, "label": name, "linestyle": "none", "markersize": size}
             if kind == "held" and flat:
                 line["markerfacecolor"] = "w"
             if kind == "surface":
@@ -181,10 +179,7 @@ class Sketch:
                 flat_face = {"facecolor": "#e0e0e0" if kind == "rigid" else "w", "edgecolor": colour, "hatch": "////"}
                 handles.append(Patch(label=name, **(flat_face if flat else {"color": colour, "alpha": THROUGH["opacity"]})))
             else:
-                marker = {"held": "^", "arrow": r"$\rightarrow$", "turn": r"$\circlearrowleft$", "arm": "P", "value": "s"}.get(
-                    kind, "o"
-                )
-                handles.append(Line2D([], [], marker=marker, **(line | {"markersize": 13 if kind in ("arrow", "turn") else 7})))
+                handles.append(Line2D([], [], marker=markers.get(kind, "o"), **line))
         if tall:
             where: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
         else:
@@ -249,9 +244,8 @@ def _draw_clamped(ax: Any, sketch: Sketch) -> None:
     some = thinned(at, 0.8 * tick)
     n = normals[of[some]]
     lean = n + 0.8 * np.stack([-n[:, 1], n[:, 0]], axis=1)
-    ax.add_collection(
-        LineCollection(np.stack([at[some], at[some] + 0.8 * tick * lean], axis=1), colors=colour, linewidths=0.8, zorder=2.5)
-    )
+    hatches = np.stack([at[some], at[some] + 0.8 * tick * lean], axis=1)
+    ax.add_collection(LineCollection(hatches, colors=colour, linewidths=0.8, zorder=2.5))
     ax.add_collection(LineCollection(corners, colors=colour, linewidths=1.6, zorder=2.6))
 
 
@@ -326,22 +320,17 @@ def _image(sketch: Sketch) -> Array:
         plotter.add_lines(ends, color=colour, width=line)
         _add_points(plotter, ends[1:2], colour, 0.6 * tick)
     for one in sketch.acting("value", "spring", "equation"):
-        _add_points(
-            plotter, one.at[thinned(one.at, 2.0 * tick)], sketch._name(one.kind, one.name, COLOURS[one.kind]), 0.35 * tick
-        )
-    turns = [
-        (
-            sketch._name("turn", one.name, COLOURS["turn"]),
-            one.at[:1],
-            sketch.unit * one.vectors[:1] / np.linalg.norm(one.vectors[0]),
-        )
-        for one in sketch.acting("turn")
-    ]
-    for colour, tails, ways in [*sketch.arrows, *turns]:
+        colour, some = sketch._name(one.kind, one.name, COLOURS[one.kind]), thinned(one.at, 2.0 * tick)
+        _add_points(plotter, one.at[some], colour, 0.35 * tick)
+    every = list(sketch.arrows)
+    for one in sketch.acting("turn"):
+        vector = sketch.unit * one.vectors[:1] / np.linalg.norm(one.vectors[0])
+        every.append((sketch._name("turn", one.name, COLOURS["turn"]), one.at[:1], vector))
+    for colour, tails, vectors in every:
         arrows = pyvista.PolyData(tails)
-        arrows["way"] = ways
+        arrows["vector"] = vectors
         arrow = pyvista.Arrow(tip_length=0.35, tip_radius=0.11, shaft_radius=0.035)
-        plotter.add_mesh(arrows.glyph(orient="way", scale="way", geom=arrow), color=colour, ambient=0.4)
+        plotter.add_mesh(arrows.glyph(orient="vector", scale="vector", geom=arrow), color=colour, ambient=0.4)
     return pictures3d.taken(plotter, look.view, sketch.box)
 
 
