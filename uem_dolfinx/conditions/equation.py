@@ -191,14 +191,14 @@ class Periodic(given.Sealed):
         agree(config.comm, error)
         # a node on the axis is its own image
         node = np.column_stack([config.to_global(follower), there])
-        n, apart = len(node), node[:, 0] != node[:, 1]
+        n, distinct = len(node), node[:, 0] != node[:, 1]
         c = np.empty((n, g, 2, g))
         c[:, :, 0], c[:, :, 1] = np.eye(g), -R
         node = np.broadcast_to(node[:, None], (n, g, 2))
         value = np.broadcast_to(np.arange(g), (n, g))
         if self._turn is None:
             # without a rotation the equations of such a node are trivial
-            c, node, value = c[apart], node[apart], value[apart]
+            c, node, value = c[distinct], node[distinct], value[distinct]
         return _of_terms(value.ravel(), node.reshape(-1, 2), c.reshape(-1, 2, g))
 
     def _images(self, config: Configuration, x: Array, shift: Array, role: str) -> Array:
@@ -278,14 +278,14 @@ def _rotation(turn: npt.ArrayLike) -> Array:
     return R
 
 
-def checked_value(what: str, value: Any, size: int | None) -> Any:
+def checked_value(name: str, value: Any, size: int | None) -> Any:
     """An unchanged right-hand side, after a check: ``size`` numbers, None for 1, 2 or 3."""
     if not callable(value) or isinstance(value, fem.Constant):
-        values_of(what, value, size)
+        values_of(name, value, size)
     return value
 
 
-def values_of(what: str, value: Any, size: int | None) -> Array:
+def values_of(name: str, value: Any, size: int | None) -> Array:
     """Numbers of a right-hand side: ``(size,)``; a single 0 is a vector of zeros.
 
     Raises:
@@ -296,9 +296,9 @@ def values_of(what: str, value: Any, size: int | None) -> Array:
     try:
         array = np.array(value.value if held else value, dtype=float, ndmin=1)
     except (TypeError, ValueError):
-        raise InputTypeError(given.sentence(what, value, f"{words}, a Constant, or a function of the load factor")) from None
+        raise InputTypeError(given.sentence(name, value, f"{words}, a Constant, or a function of the load factor")) from None
     zero = not held and len(array) == 1 and not array.any()
     if array.ndim != 1 or not (len(array) in ((size,) if size else (1, 2, 3)) or zero) or not np.isfinite(array).all():
         remedy = "a single number has no direction" if array.shape == (1,) and np.isfinite(array[0]) else ""
-        raise InputError(given.sentence(what, value.value if held else value, words, remedy))
+        raise InputError(given.sentence(name, value.value if held else value, words, remedy))
     return np.zeros(size) if zero and size else array

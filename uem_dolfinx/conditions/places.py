@@ -73,8 +73,8 @@ def _node_at(config: Configuration, point: Array, role: str) -> Indices:
     if not every[first, 0] <= NEAR * every[second, 0]:
         place = ", ".join(f"{x:.6g}" for x in every[first, 1:])
         raise InputError(
-            f"{role} = {described(point)}: no node is there, the nearest one is {every[first, 0]:.3g} away at ({place}): give the place "
-            "of a node, as the mesh was drawn, or a tag of a point"
+            f"{role} = {described(point)}: no node is there, the nearest one is {every[first, 0]:.3g} away at ({place}): give the "
+            "reference position of a node, or a tag of a point"
         )
     return nearest[:1].astype(np.int32) if first // 2 == config.comm.rank else np.zeros(0, dtype=np.int32)
 

@@ -137,7 +137,7 @@ class RigidCoupling(given.Sealed):
         """The nodes in its problem; SpaceError if it belongs to no problem."""
         if self._set is None:
             raise SpaceError(
-                f"the RigidCoupling of '{self.name}' is in no problem yet: hand it to UnitedProblem(..., couplings=[...])"
+                f"the RigidCoupling of '{self.name}' is in no problem yet: pass it to UnitedProblem(..., couplings=[...])"
             )
         return self._set
 

@@ -32,7 +32,7 @@ from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.rigid import Motion, rotation_matrix
 from uem_dolfinx.parallel import agree, gathered, reduced
 
-#: Components of a set are chosen anew when the least singular value of their rows falls below this part of what it was.
+#: Components of a set are chosen anew when the least singular value of their rows falls below this part of its initial value.
 #: [convention; least singular value of their rows; test_rigid_coupling.py::test_when_components_are_chosen_anew]
 REDUCED = 0.5
 
@@ -295,8 +295,8 @@ class RigidRows:
         everywhere = velocities(config.X[: config.n_owned] + u - s.middle - at.motion.translation) * scale
         W = np.stack([times_mass(field)[nodes] for field in np.moveaxis(everywhere, 2, 0)], axis=2)
         G, plain = (reduced(comm, np.einsum("ngz,ngy->zy", X, V)) for X in (W, V))
-        alone = not np.trace(G) > 0.0
-        if alone and added is None:
+        massless = not np.trace(G) > 0.0
+        if massless and added is None:
             return v[nodes], a[nodes]
         if added is not None:
             G = G + added.mass_of(at) * np.outer(scale, scale)
@@ -313,7 +313,7 @@ class RigidRows:
             if added is not None:
                 momentum = momentum + scale * np.einsum("n,ngz,ng->z", added.masses, added.motions(at), of_point)
             momentum = momentum / size
-            if alone:
+            if massless:
                 # without mass of the nodes, the prescribed components follow from the added mass
                 return scale * np.asarray(np.linalg.lstsq(G, momentum, rcond=None)[0], dtype=float)
             known = C @ np.linalg.solve(plain, sums)
@@ -333,7 +333,7 @@ class RigidRows:
         at_point = added.bend(at, turn)
         dz = rigid(left, added.acceleration - at_point)
         added.change_rates(added.motions(at) @ z, added.motions(at) @ dz + at_point)
-        return (v[nodes], a[nodes]) if alone else (velocities(arms) @ z, velocities(arms) @ dz + bend)
+        return (v[nodes], a[nodes]) if massless else (velocities(arms) @ z, velocities(arms) @ dz + bend)
 
     # -- components that the set keeps -------------------------------------------------------------------------------------
 

@@ -81,12 +81,12 @@ class UnitedRows:
         self._refuse(rows, item, ~able, "leaves nothing to eliminate, as its components are prescribed or cancel: leave it out")
         spared = config.ask_owners(rows.node, contactors[:, None].astype(float))[:, 0] > 0
         chosen = singles(config, rows, size, spared)
-        alone, shared = chosen >= 0, able & (chosen < 0)
+        single, shared = chosen >= 0, able & (chosen < 0)
         # terms of independent equations are renumbered
-        place = np.cumsum(alone[rows.row]) - 1
+        place = np.cumsum(single[rows.row]) - 1
         g = config.block
-        own = chosen[alone]
-        solved = [self._sent(divided(rows.select(alone), place[own // g] * g + own % g))]
+        own = chosen[single]
+        solved = [self._sent(divided(rows.select(single), place[own // g] * g + own % g))]
         follows = np.zeros(len(rows), dtype=bool)
         if reduced(config.comm, int(shared.sum())):
             terms = shared[rows.row]

@@ -46,8 +46,8 @@ def check_ties(gdim: int, contacts: Sequence[Any], equations: Sequence[Any], **o
     for contact in contacts:
         if contact.heats:
             raise InputError(f"contact '{contact.name}': a tie of temperatures conducts heat without resistance: leave heat out")
-    for name, what in others.items():
-        if what:
+    for name, value in others.items():
+        if value:
             raise InputError(f"{name} is for displacements, and u is a scalar field: leave it out")
 
 

@@ -46,9 +46,8 @@ class Dynamics(given.Sealed):
             no strain.
         damping: function of the velocity, a UFL expression, that returns a form, linear in the test function, to add to the residual:
             ``lambda rate: eta * ufl.inner(ufl.sym(ufl.grad(rate)), ufl.sym(ufl.grad(v))) * ufl.dx``.
-        contactors: ``"massless"`` moves the mass of the contactors to neighbouring nodes [UEM, 5], and the mass of the target nodes
-            below them in bodies with sufficiently fine meshes, so that impact itself neither dissipates nor adds energy; ``"massy"``
-            does not move mass.
+        contactors: ``"massless"`` moves the mass of the contactors to neighbouring nodes [UEM, 5], and also of the target nodes below
+            them in bodies with fine meshes; impact itself then neither dissipates nor adds energy. ``"massy"`` does not move mass.
         time: at the start.
 
     Attributes:

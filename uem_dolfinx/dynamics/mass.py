@@ -111,7 +111,7 @@ class Mass:
 
         With M0, which is M with zero rows and columns at these nodes, the new mass is ``S M0 S``. S is diagonal and scales component c
         of node i by ``max(1 + p_c(X_i), sqrt(1 - b))``. The polynomials p_c, of degree 2 in each body, preserve mass, first and second
-        moments ``x_a' M x_b`` of each component, and so the momentum and energy of every motion with a velocity linear in X, including
+        moments ``x_a' M x_b`` of each component. This preserves momentum and energy of motions with a velocity linear in X, including
         rigid motions. Nodes lose at most the part b of their own mass, and the eigenvalues of ``S M0 S`` are bounded from below by
         those of ``(1 - b) M0``. For diagonal M this redistributes nodal masses, after Khenous,
         Laborde and Renard, "Mass redistribution method for finite element contact problems in elastodynamics", Eur. J. Mech.
