@@ -163,14 +163,6 @@ def test_states_that_come_again():
     assert pivoting.choose(4, 7) == Rule.ALL
 
 
-def test_when_others_go_with_the_worst():
-    """When it goes alone, until it has gone alone from the same state twice."""
-    pivoting = active_set.Pivoting()
-    assert [(pivoting.choose(1, n), pivoting.ahead) for n in (7, 8, 7)] == [(0, False), (0, False), (1, True)]
-    pivoting.start_again()
-    assert [(pivoting.choose(5, n), pivoting.ahead) for n in (6, 7, 6, 7)] == [(0, False), (0, False), (1, True), (1, False)]
-
-
 @pytest.mark.parametrize("radius", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize(("gdim", "slender"), [(3, 50.0), (2, 10.0), (2, 100.0), (2, 1000.0)])
 @pytest.mark.parametrize("sides", [1, 2])

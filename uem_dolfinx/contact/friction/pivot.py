@@ -10,7 +10,6 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.friction.slip_front import Front
     from uem_dolfinx.contact.seam.relative_motion import Ties
     from uem_dolfinx.geometry.rigid import Motion
 
@@ -23,27 +22,23 @@ class Pivot:
         released: contactors that have been released.
         turned: contactors whose slip has been reversed.
         begun: contactors that have begun to slip.
-        taken: contactors that slip in advance.
         stiffness: stiffness c.
         q: forces that define the slip directions ``(n, gdim)``.
         tau: force part of ``q`` ``(n, gdim)``.
-        front: slip front.
     """
 
     released: Bools
     turned: Bools
     begun: Bools
-    taken: Bools
     stiffness: Array
     q: Array
     tau: Array
-    front: Front
 
     @classmethod
-    def begin(cls, front: Front, stiffness: Array, q: Array, tau: Array) -> Pivot:
+    def begin(cls, stiffness: Array, q: Array, tau: Array) -> Pivot:
         """The record before the first exchange."""
         none = np.zeros(len(stiffness), dtype=bool)
-        return cls(none, none, none, none, stiffness, q, tau, front)
+        return cls(none, none, none, stiffness, q, tau)
 
 
 @dataclass(frozen=True)

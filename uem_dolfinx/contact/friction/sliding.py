@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -20,7 +20,6 @@ from uem_dolfinx.contact.friction.frame import Frame
 from uem_dolfinx.contact.friction.limits import Limits
 from uem_dolfinx.contact.friction.pivot import LastStep, Pivot
 from uem_dolfinx.contact.friction.rows import with_friction
-from uem_dolfinx.contact.friction.slip_front import Front
 from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING, Violations
 from uem_dolfinx.contact.seam.corners import friction_in
@@ -57,8 +56,6 @@ class Sliding:
 
     frame: Frame
 
-    front: Any = Front  #: Class of the slip front, made for each linearised problem.
-
     def __init__(
         self,
         config: Configuration,
@@ -81,7 +78,7 @@ class Sliding:
         self._anchors: Array = np.zeros((n, g))
         self._held_by: tuple[Ints, Ints, Array] | None = None
         self._last: LastStep | None = None
-        self.pivot = Pivot.begin(self.front(self.config.comm), np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
+        self.pivot = Pivot.begin(np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set the law and the values of its parameter ``(n,)``."""
@@ -222,30 +219,21 @@ class Sliding:
         state: PairState,
         committed: PairState,
         kinematics: Kinematics,
-        ahead: bool,
         enter: Callable[[PairState], PairState],
-    ) -> tuple[PairState, bool]:
-        """Exchange violated contactors between stick and slip (collective).
+    ) -> PairState:
+        """The state with violated contactors exchanged between stick and slip (collective).
 
         Args:
             violated: contactors to be exchanged.
             state: of the interface.
             committed: state of the last step.
             kinematics: of the contactors.
-            ahead: whether contactors next to the slip front slip in advance.
             enter: function that activates and releases contactors (collective).
-
-        Returns:
-            The state, and whether any contactor slips in advance.
         """
         assert isinstance(violated, stick_slip.FrictionViolations)
         seen, pivot, share = violated.seen, self.pivot, kinematics.force_per_multiplier[:, None]
         tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, violated.driven
         space, size = self.config.gdim == 3 and self.discretisation.pointwise, np.linalg.norm(seen.slip, axis=1)
-        if ahead:
-            taken, tau = self._next_in_line(violated, state, kinematics.points, tau)
-            pivot = replace(pivot, taken=taken)
-        slide = violated.slide | pivot.taken if ahead else violated.slide
         # a contactor whose slip reverses first slips the other way, since contactors would otherwise reverse one by one; at the
         # second reversal it sticks, since soft bodies would reverse for ever. Nodes in 3D that begin to slip change direction while
         # the force q is outside the cone; unrestrained bodies (slip above the model's size) stick
@@ -255,7 +243,7 @@ class Sliding:
         turns = violated.hold & (size > 0) & (forced | (beyond & (size < self.config.size)))
         # a contactor that touched before and re-enters slips: sticking could cause tension and endless release
         back = (violated.enter & (committed.active | pivot.released | forced) | violated.slide & forced) & (size > 0)
-        changed = replace(violated, slide=slide, hold=violated.hold & ~turns)
+        slide, changed = violated.slide, replace(violated, hold=violated.hold & ~turns)
         state = enter(replace(state, friction=stick_slip.exchange(_of(state), changed, tau)))
         led_by = pivot.stiffness[:, None] * slip if self.config.gdim == 3 else slip
         way = np.where((turns & ~forced)[:, None] & space, q, led_by)
@@ -266,16 +254,7 @@ class Sliding:
         of_q[led] = (pivot.stiffness[:, None] * self.frame.slip)[led]
         released, turned, begun = pivot.released | violated.release, pivot.turned | turns, pivot.begun | slide
         self.pivot = replace(pivot, released=released, turned=turned, begun=begun, q=q, tau=of_q)
-        return state, ahead and bool(reduced(self.config.comm, pivot.taken.any(), op=MPI.LOR))
-
-    def _next_in_line(
-        self, violated: stick_slip.FrictionViolations, state: PairState, at: Array, tau: Array
-    ) -> tuple[Bools, Array]:
-        """Contactors next to the slip front that slip in advance ``(n,)``, and their forces (collective)."""
-        stick, begin = self.active(state) & _of(state).stick, violated.slide & ~violated.driven
-        near, force = self.pivot.front.along(begin, self.pivot.taken & stick, tau, at)
-        near &= stick & ~begin & ~violated.release
-        return near, np.where(near[:, None], self.frame.tangential(force), tau)
+        return state
 
     def turn(self, state: PairState, kinematics: Kinematics, stiffness: Array) -> PairState:
         """Begin another linearised problem: slip directions from current positions and the last predicted forces.
@@ -287,7 +266,7 @@ class Sliding:
         """
         frame, none = self.frame, np.zeros((len(self.nodes), self.config.gdim))
         if self.config.gdim == 2:
-            self.pivot = Pivot.begin(self.front(self.config.comm), np.zeros(len(none)), none, none)
+            self.pivot = Pivot.begin(np.zeros(len(none)), none, none)
             return state
         k, ties = np.abs(stiffness).mean(axis=1, keepdims=True), frame.ties
         c = stick_slip.slip_stiffness(k[self.nodes, 0], ties.row, ties.weight, self.config.ask_owners(ties.followed, k)[:, 0])
@@ -298,7 +277,7 @@ class Sliding:
         goes = (frame.forced(frame.away, self._lost) > least) | stick_slip.continues(_of(state).direction, T, frame.away, least)
         tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
         q = c[:, None] * frame.slip - tau
-        self.pivot = Pivot.begin(self.front(self.config.comm), c, q, tau)
+        self.pivot = Pivot.begin(c, q, tau)
         return replace(state, friction=stick_slip.turned(_of(state), self.slipping(state), q))
 
     # -- equations and forces --------------------------------------------------------------------------------------------

@@ -230,8 +230,8 @@ class Interface(Told):
             return violated
         return self.friction.violated(violated, self.trial, seen, stiffness, (force_rounding, rounding), du)
 
-    def exchange(self, violated: active_set.Violations, ahead: bool) -> bool:
-        """Change the status of violated contactors, with ``ahead`` also of those next to slip: whether there are any (collective)."""
+    def exchange(self, violated: active_set.Violations) -> None:
+        """Change the status of violated contactors (collective)."""
 
         def enter(state: PairState) -> PairState:
             self.trial = state
@@ -240,9 +240,8 @@ class Interface(Told):
 
         if self.friction is None:
             enter(self.trial)
-            return False
-        self.trial, led = self.friction.exchange(violated, self.trial, self.committed, self.kinematics, ahead, enter)
-        return led
+        else:
+            self.trial = self.friction.exchange(violated, self.trial, self.committed, self.kinematics, enter)
 
     def calm(self, which: Bools) -> bool:
         """Set averaged normals in this step for contactors of ``which (n,)`` that alternate between facets: whether there are any."""

@@ -6,23 +6,18 @@ A node of several contacts occurs several times.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from itertools import pairwise
 from typing import Any
-
-from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.friction.limits import Limits
 from uem_dolfinx.contact.friction.sliding import Sliding
-from uem_dolfinx.contact.friction.slip_front import Front
 from uem_dolfinx.contact.laws.law import FrictionLaw, parameters
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
 from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.parallel import reduced
 
 
 class JoinedNodes(NodeToSurface):
@@ -126,7 +121,6 @@ class JoinedSliding(Sliding):
 
     def __init__(self, own: Sequence[Sliding], discretisation: JoinedNodes):
         first, label = own[0], discretisation.label
-        self.front = partial(Fronts, label)
         ends = np.cumsum([0, *(len(one.value) for one in own)])
 
         def areas(normal: Array | None) -> Array:
@@ -144,29 +138,3 @@ class JoinedSliding(Sliding):
             keeps_feet=first.keeps_feet,
             value_now=lambda kinematics: None,
         )
-
-
-class Fronts:
-    """Slip fronts of several contacts; arguments as for ``Front`` and ``JoinedNodes``."""
-
-    def __init__(self, label: Ints, comm: MPI.Comm):
-        self._comm, self._label = comm, label
-        self._fronts: dict[int, Front] = {}
-
-    def along(self, begin: Bools, back: Bools, force: Array, points: Array) -> tuple[Bools, Array]:
-        """Contactors of the same contact that slip in advance ``(n,)``, and their forces ``(n, gdim)`` (collective).
-
-        Args:
-            begin: contactors that begin to slip ``(n,)``.
-            back: contactors that slipped in advance and stick again ``(n,)``.
-            force: tangential forces ``(n, gdim)``.
-            points: positions of contactors ``(n, gdim)``.
-        """
-        n = int(reduced(self._comm, int(self._label.max(initial=-1)), op=MPI.MAX)) + 1
-        some = reduced(self._comm, np.bincount(self._label[begin], minlength=n))
-        along, taken = np.zeros(len(points), dtype=bool), np.zeros(points.shape)
-        for k in np.flatnonzero(some).tolist():
-            own = self._label == k
-            front = self._fronts.setdefault(k, Front(self._comm))
-            along[own], taken[own] = front.along(begin[own], back[own], force[own], points[own])
-        return along, taken

@@ -170,18 +170,6 @@ class Pivoting:
         self._tries = PATIENCE
         self._rule = Rule.ALL
         self._seen: set[Hashable] = set()
-        #: States in which only the worst was exchanged, and whether one of them has recurred.
-        self._alone: set[Hashable] = set()
-        self._again = False
-
-    @property
-    def ahead(self) -> bool:
-        """Whether contactors next to the worst may be exchanged in advance; not after a state has recurred."""
-        return self._rule == Rule.WORST and not self._again
-
-    def start_again(self) -> None:
-        """Return to the exchange of all violated contactors, after an exchange in advance."""
-        self._fewest = np.inf
 
     def choose(self, count: int, state: Hashable) -> int:
         """The rule for the next exchange.
@@ -197,9 +185,6 @@ class Pivoting:
         if self._rule < Rule.NONE and (state in self._seen or self._tries < 0):
             self._rule, self._tries, self._seen = self._rule + 1, PATIENCE, set()
         self._seen.add(state)
-        if self._rule == Rule.WORST:
-            self._again = self._again or state in self._alone
-            self._alone.add(state)
         return self._rule
 
 

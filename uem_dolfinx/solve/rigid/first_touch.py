@@ -56,7 +56,7 @@ def touch_ahead(
         violated.append(pair.violated(gap, pair.traction._replace(lam=none), none, none, near, False, du))
     if reduced(comm, any(w.enter.any() for w in violated), op=MPI.LOR):
         for pair, first in zip(pairs, deepest_of(pairs, gaps, violated)):
-            pair.exchange(first, False)
+            pair.exchange(first)
 
 
 def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequence[Violations]) -> list[Violations]:

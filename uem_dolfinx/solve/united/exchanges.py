@@ -139,15 +139,6 @@ class Exchanges:
         self._number, self._pivoting = self._number + 1, Pivoting()
         return True
 
-    @property
-    def ahead(self) -> bool:
-        """See ``Pivoting``."""
-        return self._pivoting.ahead
-
-    def start_again(self) -> None:
-        """See ``Pivoting``."""
-        self._pivoting.start_again()
-
     def choose(
         self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0
     ) -> list[Violations] | None:

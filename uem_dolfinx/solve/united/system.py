@@ -311,8 +311,8 @@ class BodySystem:
                 self._take(forces)
                 return None
             self.curvature = None if self.exchanges.straight else self.curvature
-            if any([pair.exchange(w, self.exchanges.ahead) for pair, w in zip(self.pairs, chosen) if pair.asked]):
-                self.exchanges.start_again()
+            for pair, w in ((pair, w) for pair, w in zip(self.pairs, chosen) if pair.asked):
+                pair.exchange(w)
             return self._with_rows(state)
 
     def _with_rows(self, state: BodyState) -> BodyState:
