@@ -156,7 +156,7 @@ def test_straight_facets_of_a_curved_mesh(degree, bulge, expected, caplog):
     uem.UnitedProblem(linear(u, 1.0), u, contacts=[contact])
     assert told(caplog, "replaces the curved facets") == expected
     # a parabola of height 0.1 on two facets of half its width
-    assert told(caplog, "up to 0.025 off them") == expected
+    assert told(caplog, "up to 0.025 away") == expected
 
 
 # -- ends --------------------------------------------------------------------------------------------------------------

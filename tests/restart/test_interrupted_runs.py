@@ -360,7 +360,7 @@ def test_what_dynamics_refuse():
     """A load that is not finite, the dynamics of another problem, and a velocity that is another space's on one rank alone."""
     impact = Impact(moving=False)
     impact.problem.load = lambda t: setattr(impact.push, "value", np.nan)
-    with pytest.raises(uem.NotFiniteError, match="forces at the start, time 0, hold NaN"):
+    with pytest.raises(uem.NotFiniteError, match="forces at the start, time 0, contain NaN"):
         next(uem.time_steps(impact.problem, DT, END))
     F = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(impact.u, ufl.TestFunction(impact.V)) * ufl.dx
     with pytest.raises(uem.SpaceError, match="dynamics belong to another problem"):
