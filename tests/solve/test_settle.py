@@ -110,4 +110,4 @@ def test_when_arrays_are_used(cheap, first, monkeypatch):
         assert not own.take_long(none, cheap)
         taken += [number] * own.take_long(wrong, cheap)
         own._solve_again()
-    assert taken == [first] and (first < 4 or cheap) and 4 < AS_LONG_IF_CHEAP < 15
+    assert taken == [first] and (4 < first < 15 if cheap else 0 < first < 4)
