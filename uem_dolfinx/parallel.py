@@ -264,6 +264,12 @@ def gathered(comm: MPI.Comm, value: Any) -> AnyArray:
     return every
 
 
+def on_root(comm: MPI.Comm, values: AnyArray) -> Any:
+    """Arrays of all ranks, one after the other, on rank 0; an empty array on the other ranks (collective)."""
+    parts = comm.gather(values)
+    return np.concatenate(parts) if parts is not None else np.zeros(0)
+
+
 def reduced(comm: MPI.Comm, value: Any, op: MPI.Op = MPI.SUM) -> Any:
     """Sum, or another reduction, of a number or an array ``(...)`` over all ranks, of the same type (collective)."""
     if comm.size == 1:

@@ -29,7 +29,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import on_root, reduced
 
 #: A sparse factorisation takes as long, beside its arithmetic, as so many floating-point operations for each unknown.
 #: [heuristic; operations; test_condensed.py::test_which_way_is_cheaper]
@@ -209,11 +209,11 @@ class Condensed:
             rows = P.rows_of(nodes)
             test_rows = rows if P is Q else Q.rows_of(nodes)
         with timed("condensed matrix"):
-            numbers = self._gathered(nodes + self.space.first)
+            numbers = on_root(self.space.comm, nodes + self.space.first)
             trial = self._on_root(rows, numbers)
             test = trial if P is Q else self._on_root(test_rows, numbers)
             curvature = None if G is None else self._on_root(blocks_of_matrix(self.space, G), numbers)
-            used = self._gathered(P.used.ravel()[self._at].astype(float)) > 0
+            used = on_root(self.space.comm, P.used.ravel()[self._at].astype(float)) > 0
             self.made_of, self._dense, self.negative = (P, Q, self._made_for[0], G), None, False
             if self.space.comm.rank == 0:
                 self._dense = _Dense(self._St, curvature, trial[:, used], None if P is Q else test[:, used], used)
@@ -316,12 +316,12 @@ class Condensed:
 
     def _on_contact(self, rhs: Array) -> Array:
         """Solution of the dense problem at this rank's components of C (collective)."""
-        every = self._gathered(rhs)
+        every = on_root(self.space.comm, rhs)
         return self._scattered(None if self._dense is None else self._dense.solve(every))
 
     def _stiffness(self, du: Array) -> Array:
         """``S du_C`` at this rank's components of C (collective)."""
-        every = self._gathered(du)
+        every = on_root(self.space.comm, du)
         return self._scattered(every @ self._St if self.space.comm.rank == 0 else None)
 
     def _on_root(self, blocks: Blocks, numbers: Ints) -> Any:
@@ -341,11 +341,6 @@ class Condensed:
         indptr = np.append(0, np.cumsum(np.bincount(np.searchsorted(numbers, row), minlength=len(numbers))))
         size = self.space.block * len(numbers)
         return bsr_matrix((value[order], np.searchsorted(numbers, column[order]), indptr), shape=(size, size)).tocsr()
-
-    def _gathered(self, values: Any) -> Any:
-        """Values at C of all ranks, on rank 0 (collective)."""
-        parts = self.space.comm.gather(values)
-        return np.concatenate(parts) if parts is not None else np.zeros(0)
 
     def _scattered(self, values: Array | None) -> Array:
         """Values from rank 0 at this rank's components of C (collective)."""

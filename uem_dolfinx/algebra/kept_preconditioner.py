@@ -27,7 +27,6 @@ class KeptPreconditioner:
     def __init__(self) -> None:
         self.kept = False
         self._made_with: UnitingEquations | None = None
-        self._now: UnitingEquations | None = None
         #: Iterations per digit at first, and in the last solve.
         self._first_pace = self._pace = 0.0
 
@@ -42,15 +41,10 @@ class KeptPreconditioner:
     def serves(self, equations: UnitingEquations, changed: int, present: int) -> bool:
         """Whether to reuse it for the present matrix, from ``changes`` summed over all ranks; otherwise it counts as made anew."""
         known = self._made_with is not None
-        self._now = equations
         self.kept = known and changed <= KEPT_CHANGES * present and 0.0 < self._pace <= KEPT_SLOWER * self._first_pace
         if not self.kept:
-            self.renew()
+            self._made_with, self._first_pace = equations, 0.0
         return self.kept
-
-    def renew(self) -> None:
-        """Count as made for the present matrix."""
-        self.kept, self._made_with, self._first_pace = False, self._now, 0.0
 
     def most(self, rtol: float) -> int | None:
         """Iterations within which a kept preconditioner reduces the residual by ``rtol``, or is made anew; None for a new one."""

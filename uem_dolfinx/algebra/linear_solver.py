@@ -66,7 +66,7 @@ class UnitedSolver:
         #: Fingerprint of the matrices that the last constrained matrix was made of.
         self._made_of: Any = None
         #: Arguments of the present constrained matrix.
-        self._asked: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
+        self._arguments: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
         #: P and K of the present constrained matrix, if it is symmetric and factorised.
         self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
         #: Whether Q is not P, and whether a step begins.
@@ -102,7 +102,7 @@ class UnitedSolver:
 
     def forget(self) -> None:
         """Drop the constrained matrix, factorisations and the set-up of the preconditioner (collective)."""
-        self._A = self._crossed = self._served = self._factor_of = self._of = self._made_of = None
+        self._A = self._crossed = self._served = self._factor_of = self._of = self._made_of = self._arguments = None
         self._kept.drop()
         self.condensed.drop()
         self._use(self._first)
@@ -162,7 +162,7 @@ class UnitedSolver:
         if same and not (self._begins and otherwise):
             self._begins, self._of = False, (K, K.stateGet())
             return
-        self._petrov_galerkin, self._asked = test is not restriction, (restriction, K, G, test)
+        self._petrov_galerkin, self._arguments = test is not restriction, (restriction, K, G, test)
         if self._begins and self.options is not self._first:
             self._use(self._first)
         self._begins = False
@@ -203,7 +203,7 @@ class UnitedSolver:
             self._use(self._instead)
         symmetric = not unsymmetric
         self._adapt(symmetric)
-        self._new = not (self._preconditioner.serves(restriction.equations, *changes) and self.iterative)
+        self._new = not (self.iterative and self._preconditioner.serves(restriction.equations, *changes))
         self.pc.setReusePreconditioner(not self._new)
         self._A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if self._new and self.needs_near_null_space:
@@ -395,8 +395,8 @@ class UnitedSolver:
             logger.debug("the preconditioner is made anew after %d iterations with an earlier one", iterations)
             self._made_of = None
             self._use(self.options)
-            assert self._asked is not None
-            self.set_operator(*self._asked)
+            assert self._arguments is not None
+            self.set_operator(*self._arguments)
             dq, more = self.solve(rhs, accuracy, near)
             return dq, iterations + more
         if reason < 0 and self._at_need and self.iterative:
@@ -432,7 +432,7 @@ class UnitedSolver:
     def _iterate(self, rhs: PETSc.Vec, dq: PETSc.Vec) -> bool:
         """Solve by the KSP from ``dq``; whether an earlier preconditioner takes too many iterations for that (collective)."""
         rtol, _, _, bound = self.ksp.getTolerances()
-        most = self._preconditioner.most(rtol) if self.iterative else None
+        most = self._preconditioner.most(rtol)
         kept = most is not None and most < bound
         if kept:
             self.ksp.setTolerances(max_it=most)

@@ -22,9 +22,10 @@ from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.entries import is_symmetric, stiffen
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import on_root
 
 
 class RelativeCoordinates:
@@ -105,18 +106,13 @@ class Condensation:
         self._pc.apply(inside, moved)
         moved.array[at] = 0.0
         left = y - self.A * moved
-        return self.gathered(left.array_r[at])
+        return on_root(self.space.comm, left.array_r[at])
 
     def numbers(self, which: Ints) -> Ints:
         """Positions in S of the slots of some equations ``(...)``, -1 for -1 (collective)."""
         counts = self.space.comm.allgather(len(self._at))
         first = sum(counts[: self.space.comm.rank])
         return np.where(which >= 0, first + np.searchsorted(self._at, self.trial.slot[which]), -1)
-
-    def gathered(self, values: Array) -> Any:
-        """Arrays of all ranks, one after the other, on rank 0 (collective)."""
-        parts = self.space.comm.gather(values)
-        return np.concatenate(parts) if parts is not None else np.zeros(0)
 
     def destroy(self) -> None:
         """Free the factors (collective)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -163,10 +163,6 @@ class UserRows:
     def forces(self, multipliers: Array) -> Array:
         """Forces of the equations on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
         return forces_of(self._config, self.equations, multipliers)
-
-
-#: Equations of users as rigid couplings.
-RigidNodes: TypeAlias = UserRows
 
 
 def _refuse_shared(coupling: RigidCoupling, taken: Bools) -> None:

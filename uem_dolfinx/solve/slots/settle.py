@@ -26,7 +26,7 @@ from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import ConflictError
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import on_root, reduced
 from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.bodies.tangent import known_forces
 from uem_dolfinx.solve.slots import coulomb
@@ -98,20 +98,16 @@ class _Slots:
         if friction is not None:
             state = friction.come_and_go(state, before)
             assert state.friction is not None
-            s, way, tau = np.zeros((3, len(now), pair.config.gdim))
-            for vectors, parts in ((s, direction), (way, slip), (tau, force)):
-                vectors[i] = np.einsum("kr,krg->kg", parts, self.directions)
-            sticks = np.zeros((2, len(now)), dtype=bool)
-            sticks[:, i] = active & (friction.value[i] > 0) & np.stack([stick, ~stick])
-            pivot, slides = friction.pivot, sticks[1][:, None]
-            c = pivot.stiffness[:, None]
-            q = np.where(slides, c * way - tau, pivot.q)
-            friction.pivot = replace(pivot, q=q, tau=np.where(slides, c * friction.frame.slip, pivot.tau))
-            chosen = np.zeros_like(now)
-            chosen[i] = True
-            f = state.friction
-            s = np.where(chosen[:, None], np.where(slides, s, 0.0), f.direction)
-            state = replace(state, friction=replace(f, stick=np.where(chosen, sticks[0], f.stick), direction=s))
+            s, way, tau = (np.einsum("kr,krg->kg", parts, self.directions) for parts in (direction, slip, force))
+            rubs = active & (friction.value[i] > 0)
+            slides = rubs & ~stick
+            sticks, directions = state.friction.stick.copy(), state.friction.direction.copy()
+            sticks[i], directions[i] = rubs & stick, np.where(slides[:, None], s, 0.0)
+            state = replace(state, friction=replace(state.friction, stick=sticks, direction=directions))
+            q, of_slip, j = friction.pivot.q.copy(), friction.pivot.tau.copy(), i[slides]
+            c = friction.pivot.stiffness[j, None]
+            q[j], of_slip[j] = c * way[slides] - tau[slides], c * friction.frame.slip[j]
+            friction.pivot = replace(friction.pivot, q=q, tau=of_slip)
         pair.trial = state
 
 
@@ -151,7 +147,7 @@ def settle(
     normal, tangents = (np.concatenate([getattr(one, name) for one in slots]) for name in ("normal", "tangents"))
     limits = [np.concatenate(parts) for parts in zip(*(one.limits() for one in slots))]
     slip = np.where(tangents >= 0, gap[tangents], 0.0)
-    arrays = [condensed.gathered(a) for a in (*map(condensed.numbers, (normal, tangents)), gap[normal], slip, *limits)]
+    arrays = [on_root(comm, a) for a in (*map(condensed.numbers, (normal, tangents)), gap[normal], slip, *limits)]
     found = coulomb.solve(coulomb.SlotProblem(condensed.stiffness, load, *arrays)) if comm.rank == 0 else None
     condensed.destroy()
     states = comm.bcast(None if found is None else _states(found, *arrays[1:4:2]))

@@ -26,7 +26,7 @@ from uem_dolfinx.solve.united.newton import IterationState
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.dependent import IndependentEquations
-    from uem_dolfinx.conditions.user_rows import RigidNodes, UserRows
+    from uem_dolfinx.conditions.user_rows import UserRows
     from uem_dolfinx.contact.thermal.heat import Heat, HeatEquations
     from uem_dolfinx.solve.bodies.bodies import Bodies
 
@@ -157,7 +157,7 @@ class Rows:
     test: Restriction
     frictionless: Restriction
     heat: dict[int, list[HeatEquations]]
-    rigid: RigidNodes | None = None
+    rigid: UserRows | None = None
 
     @property
     def conflict(self) -> bool:
