@@ -36,8 +36,8 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 __version__ = "0.2.0"
 
 __all__ = [
-    "Balance", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError",
-    "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "FinitePlasticity",
+    "Balance", "CentralDifferences", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact", "ContactParameter",
+    "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "FinitePlasticity",
     "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError",
     "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError",
     "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError",
@@ -117,6 +117,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.laws.thermal import OfTemperature
     from uem_dolfinx.contact.preload import Preload
+    from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
     from uem_dolfinx.dynamics.inertia import Dynamics
     from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
     from uem_dolfinx.dynamics.scheme import Scheme, generalised_alpha, newmark
@@ -139,16 +140,18 @@ if _TYPE_CHECKING:
     from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
     from uem_dolfinx.solve.modes import Vibrations, modes
     from uem_dolfinx.solve.steps.step import Step
-    from uem_dolfinx.solve.steps.time_steps import TimeStep, time_steps
+    from uem_dolfinx.solve.steps.time_step import TimeStep
+    from uem_dolfinx.solve.steps.time_steps import time_steps
 
 #: Modules that are imported on first use of one of their names.
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
+    "CentralDifferences": "dynamics.explicit.central_differences",
     "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",
     "lumped_mass": "dynamics.mass", "nodal_mass": "dynamics.mass",
     "Scheme": "dynamics.scheme", "generalised_alpha": "dynamics.scheme", "newmark": "dynamics.scheme",
-    "TimeStep": "solve.steps.time_steps", "time_steps": "solve.steps.time_steps",
+    "TimeStep": "solve.steps.time_step", "time_steps": "solve.steps.time_steps",
     "Checkpoint": "restart.checkpoint", "read_checkpoint": "restart.checkpoint", "write_checkpoint": "restart.checkpoint",
     "State": "restart.state",
     "example_mesh": "geometry.gmsh", "read_gmsh": "geometry.gmsh",

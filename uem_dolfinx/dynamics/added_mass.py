@@ -19,6 +19,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.conditions.rigid_set import Placement, moments, turned, velocities
+from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
 from uem_dolfinx.dynamics.scheme import Scheme
 from uem_dolfinx.parallel import gathered
 
@@ -48,7 +49,7 @@ class AddedMass:
         self.factor = 0.0
         self._weight = np.zeros_like(self.places)
         #: Scheme of the present step, and its coefficients; None between steps.
-        self._step: tuple[Scheme, float, Array, float, Array] | None = None
+        self._step: tuple[Scheme | CentralDifferences, float, Array, float, Array] | None = None
 
     # -- as a rigid body ---------------------------------------------------------------------------------------------------
 
@@ -153,7 +154,7 @@ class AddedMass:
         at = self._placement
         return self.motions(at) @ self.set.motion_of(at, rates)
 
-    def begin(self, scheme: Scheme, dt: float) -> None:
+    def begin(self, scheme: Scheme | CentralDifferences, dt: float) -> None:
         """Begin a step."""
         self._step = scheme, *scheme.ending(self.velocity, self.acceleration, dt)
         self.factor = scheme.factor(dt)

@@ -20,6 +20,7 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.dynamics.scheme import Scheme, newmark
 from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
@@ -40,7 +41,7 @@ class Dynamics(given.Sealed):
 
     Args:
         mass: of all bodies; bodies without mass are allowed if others or supports restrain them.
-        scheme: ``newmark()`` or ``generalised_alpha(rho_inf)``.
+        scheme: ``newmark()`` or ``generalised_alpha(rho_inf)``, or explicit, ``CentralDifferences()``.
         velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
         gravity: acceleration of free fall ``(gdim,)``; the weight of every node is its mass times gravity, so that free fall causes
             no strain.
@@ -72,7 +73,7 @@ class Dynamics(given.Sealed):
         self,
         mass: Mass,
         *,
-        scheme: Scheme | None = None,
+        scheme: Scheme | CentralDifferences | None = None,
         velocity: fem.Function | npt.ArrayLike | None = None,
         gravity: npt.ArrayLike | None = None,
         damping: Callable[[Expr], ufl.Form] | None = None,
@@ -80,7 +81,12 @@ class Dynamics(given.Sealed):
         time: float = 0.0,
     ):
         given.kind("mass", mass, isinstance(mass, Mass), "a Mass", "made by uem.lumped_mass(V, density) or uem.consistent_mass")
-        given.kind("scheme", scheme, scheme is None or isinstance(scheme, Scheme), "a Scheme, as uem.newmark(), or None")
+        given.kind(
+            "scheme",
+            scheme,
+            scheme is None or isinstance(scheme, Scheme | CentralDifferences),
+            "a Scheme, as uem.newmark(), or None",
+        )
         # UFL forms are callable, too
         makes = callable(damping) and not isinstance(damping, ufl.Form)
         given.kind(

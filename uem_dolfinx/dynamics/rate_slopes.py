@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.dynamics.scheme import Scheme
 from uem_dolfinx.parallel import reduced
 
 
@@ -55,6 +56,7 @@ class RateSlopes:
     def begin(self) -> None:
         """Begin with the present step of the dynamics, at its final displacement."""
         d, s, dt, n = self._dynamics, self._dynamics.scheme, self._dynamics.dt, self._n
+        assert isinstance(s, Scheme)
         _, last, _, u, (_, a, w, _), _ = d.memory()
         held, massy = d.held, d.massy.ravel()
         mean = self._rows(du=1.0 / dt)

@@ -20,6 +20,7 @@ from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.law import as_law, follows_load
+from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -318,6 +319,8 @@ def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> I
         given.kind("scratch", scratch, scratch is None or isinstance(scratch, (str, Path)), "a folder, or None")
         if problem.history is not None:
             raise InputError("the problem is being recorded: expected one history at a time")
+        if is_explicit(problem.dynamics):
+            raise InputError("steps of CentralDifferences have no derivatives: take an implicit scheme, as uem.newmark()")
         for contact in problem.contacts:
             if contact.pair.frictional:
                 _check_first(problem, f"those of contact '{contact.name}' with friction")

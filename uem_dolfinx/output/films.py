@@ -17,7 +17,7 @@ from uem_dolfinx.output.tables import given_path
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
-from uem_dolfinx.solve.steps.time_steps import TimeStep
+from uem_dolfinx.solve.steps.time_step import TimeStep
 
 T = TypeVar("T")
 

@@ -24,7 +24,7 @@ from uem_dolfinx.output.tables import Closing, CsvTable, refuse_shared
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
-from uem_dolfinx.solve.steps.time_steps import TimeStep
+from uem_dolfinx.solve.steps.time_step import TimeStep
 
 #: Endings of VTX files, by the rank of the tensors in them.
 ENDINGS = ("scalars", "vectors")

@@ -5,7 +5,7 @@ Most checks concern this rank only; the caller makes the ranks agree.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
@@ -49,17 +49,26 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
             raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")
 
 
-def check_dynamics(dynamics: Any) -> Dynamics | None:
+def check_dynamics(dynamics: Any, contacts: Sequence[Any], others: Mapping[str, Any], usual: bool) -> Dynamics | None:
     """The dynamics of a problem, or None.
+
+    Args:
+        dynamics: of the problem.
+        contacts: as declared.
+        others: further arguments by name, with which explicit schemes do not go unless they are empty.
+        usual: whether u is a displacement alone, and contact imposed by elimination.
 
     Raises:
         InputTypeError: for anything else.
+        InputError: for what does not go with an explicit scheme.
     """
     if dynamics is None:
         return None
+    from uem_dolfinx.dynamics.explicit.refused import refuse_unsupported
     from uem_dolfinx.dynamics.inertia import Dynamics
 
     given.kind("dynamics", dynamics, isinstance(dynamics, Dynamics), "Dynamics, or None")
+    refuse_unsupported(dynamics, contacts, {**others} | ({} if usual else {"displacement or method": True}))
     return dynamics
 
 

@@ -149,7 +149,8 @@ class UnitedProblem(given.Sealed):
                 others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
                 check_ties(self.config.gdim, contacts, equations, **others)
             self.materials = checks.check_materials(materials, F, u, displacement)
-            self.dynamics = checks.check_dynamics(dynamics)
+            beside = {"materials": self.materials, "equations": equations, "couplings": couplings}
+            self.dynamics = checks.check_dynamics(dynamics, contacts, beside, displacement is None and method is BodySystem)
             newton = given.word("newton", newton, ("full", "modified"))
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
@@ -210,7 +211,7 @@ class UnitedProblem(given.Sealed):
 
             dynamics.make_contactors_massless(self.contacts)
             warn_of_soft_targets(dynamics.mass, self.contacts, self.bodies.initial_stiffness)
-        #: Options of the system of bodies and contacts that the Newton loop solves.
+        #: Options of the system that the Newton loop solves.
         options: dict[str, Any] = {"newton": newton, "consistent_tangent": consistent_tangent}
         #: Equations of users, or None.
         self.linear: UserRows | None = None
@@ -247,8 +248,8 @@ class UnitedProblem(given.Sealed):
         from uem_dolfinx.solve.settings import Settings
 
         #: Settings of the run, for checkpoints.
-        beside = {"equations": equations, "couplings": couplings, "points": points}
-        names = {what: ", ".join(type(one).__name__ for one in some) for what, some in beside.items() if some}
+        declared = {"equations": equations, "couplings": couplings, "points": points}
+        names = {what: ", ".join(type(one).__name__ for one in some) for what, some in declared.items() if some}
         self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
         refuse_idle(self, self.load, self.bodies.bcs)
         checks.take_materials(self.materials)

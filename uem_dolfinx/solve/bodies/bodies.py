@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -290,9 +291,23 @@ class Bodies:
                     "owns the node: expected conditions at the same nodes on all ranks; locate them by uem.dirichlet, or by "
                     "fem.locate_dofs_topological on all ranks with remote=True"
                 )
+        self._take_held()
+
+    def _take_held(self) -> None:
         self.free: Bools = ~self.config.of(self.held)
         self.free_rows: Bools = self.config.rows(~self.held[: self._n_owned])
         self.tangent.hold(self.free_rows)
+
+    @contextmanager
+    def holding(self, more: Bools) -> Iterator[None]:
+        """Context in which ``more`` unknowns, ghosts included ``(n,)``, have prescribed values, too, ``wanted``."""
+        before, self.held = self.held, self.held | more
+        self._take_held()
+        try:
+            yield
+        finally:
+            self.held = before
+            self._take_held()
 
     def of_owners(self, values: AnyArray) -> AnyArray:
         """Values of all unknowns ``(n,)`` with ghosts copied from their owners, of the same type (collective)."""

@@ -6,23 +6,23 @@ Every converged step is committed, so that a failed run keeps its last converged
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import compress
 from typing import TYPE_CHECKING
-
-from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
-from uem_dolfinx.solve.stepping import ConvergedStep, begin_checkpoint, between_steps
+from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
+from uem_dolfinx.solve.steps.explicit_steps import explicit_steps
+from uem_dolfinx.solve.steps.time_step import TimeStep, events, touching
 from uem_dolfinx.solve.united.newton import Iteration
 from uem_dolfinx.solve.united.system import CLOSED
 
@@ -41,43 +41,10 @@ MOST_GIVEN = 2e-3
 SHORTEST_GIVEN = 1.0 / 128
 
 
-@dataclass(frozen=True, repr=False)
-class TimeStep(ConvergedStep):
-    """A converged time step.
-
-    Attributes:
-        number: counted from 1.
-        time: reached.
-        dt: length of the step.
-        iterations: history of the Newton loop.
-        cuts: number of times that the step was shortened.
-        touched: names of the contacts that had no active contactor before the step, and have one after it.
-        left: names of the contacts that had an active contactor before the step, and have none after it.
-    """
-
-    number: int
-    time: float
-    dt: float
-    iterations: list[Iteration]
-    cuts: int
-    touched: tuple[str, ...]
-    left: tuple[str, ...]
-
-    def __str__(self) -> str:
-        """Its number and time, and the contacts that have closed or opened in it."""
-        events = [f"{word} {', '.join(names)}" for word, names in (("touched:", self.touched), ("left:", self.left)) if names]
-        return ", ".join([f"time step {self.number}, time {self.time:.6g}", *events])
-
-    @property
-    def start(self) -> float:
-        """Time at which the step began; with ``event_tolerance`` the instant of the touches and departures in it."""
-        return self.time - self.dt
-
-
 def time_steps(
     problem: UnitedProblem,
-    dt: float,
-    end: float,
+    dt: float | None = None,
+    end: float | None = None,
     *,
     event_tolerance: float | None = None,
     checkpoint: Checkpoint | None = None,
@@ -89,7 +56,7 @@ def time_steps(
 
     Args:
         problem: with ``dynamics``; its ``load`` is called with the time.
-        dt: nominal length of the steps.
+        dt: nominal length of the steps; with ``CentralDifferences`` None chooses the longest ones that are safe.
         end: time to reach.
         event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``. The step is divided there, so
             that a step begins at the instant, unless rounding exceeds the forces of such short steps. None: steps are not divided.
@@ -100,8 +67,8 @@ def time_steps(
         An iterator of converged steps.
 
     Raises:
-        InputError, InputTypeError: if ``dt`` is not positive, or smaller than the rounding error of the time, ``end`` before the
-            start or not finite, or ``event_tolerance`` not between 0 and 1.
+        InputError, InputTypeError: if ``dt`` is not positive, beyond the critical step of an explicit scheme, or smaller than the
+            rounding error of the time, ``end`` before the start or not finite, or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
@@ -114,11 +81,29 @@ def time_steps(
     dynamics = problem.dynamics
     if dynamics is None:
         raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
+    chosen = is_explicit(dynamics) and dt is None
     with agreed(problem.comm):
-        dt, end = given.number("dt", dt, given.POSITIVE), given.number("end", end, _not_before(dynamics.start))
+        dt = dt if chosen else given.number("dt", dt, given.POSITIVE)
+        end = given.number("end", end, _not_before(dynamics.start))
+        if is_explicit(dynamics) and event_tolerance is not None:
+            raise InputError("event_tolerance is for implicit schemes: leave it out, since explicit steps are short")
         if event_tolerance is not None:
             event_tolerance = given.number("event_tolerance", event_tolerance, given.between(0.0, 1.0))
     given.alike(problem.comm, "time_steps", dt=dt, end=end, event_tolerance=event_tolerance)
+    if dt is not None:
+        _check_length(dynamics, dt, end)
+    begin_checkpoint(checkpoint, problem.state, problem.config.functions()["displacement"])
+    steps, total = explicit_steps(problem, dt, end), None
+    if not is_explicit(dynamics):
+        assert dt is not None
+        steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
+        total = max(0, round((end - dynamics.time) / dt))
+    shown = progress(steps, "time steps", total=total)
+    return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.declared)
+
+
+def _check_length(dynamics: Dynamics, dt: float, end: float) -> None:
+    """Refuse steps whose length is lost in rounding."""
     with np.errstate(all="ignore"):
         squares = np.array([dt, SHORTEST_LENGTH * dt]) ** 2
         countable = np.isfinite(squares).all() and np.isfinite(1.0 / squares).all()
@@ -129,10 +114,6 @@ def time_steps(
             f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
             "take longer steps"
         )
-    begin_checkpoint(checkpoint, problem.state, problem.config.functions()["displacement"])
-    steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
-    shown = progress(steps, "time steps", total=max(0, round((end - dynamics.time) / dt)))
-    return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.declared)
 
 
 def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None) -> Iterator[TimeStep]:
@@ -144,7 +125,7 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
     problem.system.accelerate()
     if first and problem.history is not None:
         problem.history.note_start()
-    before, rounding = _touching(problem), _rounding(dynamics, dt, end)
+    before, rounding = touching(problem), _rounding(dynamics, dt, end)
     while (remainder := end - dynamics.time) > rounding:
         # to the next multiple of dt; whole steps have equal lengths to the last bit, so that K does not change
         passed = (dynamics.time - dynamics.start) / dt
@@ -166,19 +147,16 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
         if abs(dynamics.time - nearest) <= rounding:
             dynamics.time = float(nearest)
         number, cuts = control.done(iterations)
-        after = _touching(problem)
-        changes = [(c.name, was, now) for c, was, now in zip(problem.contacts, before, after)]
-        touched = tuple(name for name, was, now in changes if now and not was)
-        left = tuple(name for name, was, now in changes if was and not now)
-        yield TimeStep(number, dynamics.time, length, iterations, cuts, touched, left)
+        after = touching(problem)
+        yield TimeStep(number, dynamics.time, length, iterations, cuts, *events(problem, before, after))
         # the caller may have repeated the step
-        before = _touching(problem)
+        before = touching(problem)
 
 
 def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: float | None) -> tuple[float, list[Iteration]]:
     """Attempt a step, or its part before the first contact closes or opens; returns its length and history (collective)."""
     iterations = _attempt(problem, length)
-    if tolerance is None or length <= tolerance or _touching(problem) == before:
+    if tolerance is None or length <= tolerance or touching(problem) == before:
         return length, iterations
     # the first trial checks whether the step begins at the instant
     low, high, trial, reached = 0.0, length, tolerance, 0.0
@@ -186,7 +164,7 @@ def _step(problem: UnitedProblem, length: float, before: list[bool], tolerance: 
         problem.restore()
         try:
             _attempt(problem, trial)
-            same = _touching(problem) == before
+            same = touching(problem) == before
             reached = trial if same else reached
         except MENDABLE:
             same = False
@@ -212,9 +190,9 @@ def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
 
 def _contact_forces(problem: UnitedProblem) -> list[Array]:
     """Contact forces on both bodies, at this rank's nodes, of each contact that should do no work (collective)."""
-    touching = compress(problem.contacts, _touching(problem))
+    closed = compress(problem.contacts, touching(problem))
     own = slice(problem.config.gdim * problem.config.n_owned)
-    return [np.array(c.force.x.array[own]) for c in touching if not c.pair.works]
+    return [np.array(c.force.x.array[own]) for c in closed if not c.pair.works]
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
@@ -279,14 +257,6 @@ def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
     pressed = np.logical_or.reduce([f != 0.0 for f in forces])
     held += 0.5 * float(K.ravel()[pressed].sum()) * open_still**2
     return float(reduced(problem.comm, held))
-
-
-def _touching(problem: UnitedProblem) -> list[bool]:
-    """Whether each contact has active contactors (collective)."""
-    if not problem.contacts:
-        return []
-    active = np.array([bool(contact.pair.united.any()) for contact in problem.contacts])
-    return list(map(bool, reduced(problem.comm, active, op=MPI.LOR)))
 
 
 def _not_before(start: float) -> given.Range:

@@ -1,0 +1,247 @@
+"""Central differences with exact contact on a surface without mass: waves, impacts, critical step, restart, what is refused.
+
+The test to read first is ``test_a_bar_on_a_wall``: force, duration, momentum and energy of an impact in closed form.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import at, box, clamp, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
+from uem_dolfinx.parallel import reduced
+
+COMM = MPI.COMM_WORLD
+SHAPES = {2: "quadrilateral", 3: "hexahedron"}
+
+
+class Flight:
+    """Bars along the last axis, of length 10, density 1 and wave speed 30, that fly downwards onto a wall or onto each other.
+
+    Args:
+        dim: of space.
+        cells: along each bar.
+        speed: of the uppermost bar.
+        gap: below each bar.
+        bars: their number; the lower of two stands on nothing.
+        law: of both.
+        impedance: of the lower of two bars over that of the upper, at the same wave speed.
+        nu: Poisson's ratio.
+        pose: of the mesh, see ``scene``.
+        how: arguments of the contact.
+    """
+
+    def __init__(
+        self, dim=2, cells=40, speed=10.0, gap=0.5, bars=1, law=uem.LinearElastic, impedance=1.0, nu=0.0, pose=lambda x: x, **how
+    ):
+        across = [1.0] * (dim - 1)
+        places = [gap, 10.0 + 2 * gap][:bars]
+        parts = [
+            box(SHAPES[dim], [*[0.0] * (dim - 1), y], [*across, y + 10.0], [*[1 + k] * (dim - 1), cells])
+            for k, y in enumerate(places)
+        ]
+        self.scene, self.dim = scene(COMM, SHAPES[dim], parts, pose=pose), dim
+        V = compat.function_space(self.scene.mesh, 1, (dim,))
+        self.u, v, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
+        self.split = 10.0 + 1.5 * gap if bars == 2 else -1.0
+        upper = V.tabulate_dof_coordinates()[:, dim - 1] > self.split
+        velocity.x.array.reshape(-1, dim)[upper, dim - 1] = -speed
+        x = ufl.SpatialCoordinate(self.scene.mesh)
+        density = ufl.conditional(ufl.lt(x[dim - 1], self.split), impedance, 1.0)
+        material = law(900.0 * density, nu, kind="plane_stress" if dim == 2 else "3d")
+        self.dynamics = uem.Dynamics(uem.lumped_mass(V, density), velocity=velocity, scheme=uem.CentralDifferences())
+        bottom = self.scene.tag("bottom", bars - 1, at(dim - 1, places[-1]))
+        plane = uem.RigidPlane(np.zeros(dim), np.eye(dim)[-1])
+        target = plane if bars == 1 else self.scene.tag("top", 0, at(dim - 1, places[0] + 10.0))
+        self.contact = uem.Contact(bottom, target, name="touch", **how)
+        self.problem = uem.UnitedProblem(
+            material.residual(self.u, v) * ufl.dx, self.u, contacts=[self.contact], dynamics=self.dynamics, rtol=1e-12
+        )
+        self.stored = material.energy(self.u) * ufl.dx
+        self.rows = []
+
+    def run(self, end, dt=None, **how):
+        """Columns time, force, sum of energies over the first, momentum along the last axis."""
+        book = uem.EnergyBook(self.problem, self.stored)
+        for step in uem.time_steps(self.problem, dt, end, **how):
+            row = book.write(step)
+            energy = (row.kinetic + row.stored) / book.rows[0].kinetic
+            self.rows.append((row.time, self.contact.resultant().force[-1], energy, book.momenta[-1][-1]))
+            self.last = step
+        self.book = book
+        return np.array(self.rows).T
+
+    @property
+    def size(self):
+        """Norm of the displacement (collective)."""
+        own = self.u.x.array[: self.problem.config.n_owned * self.dim]
+        return float(np.sqrt(reduced(COMM, float(own @ own))))
+
+
+@pytest.mark.parametrize(("dim", "law", "speed", "within"), [(2, uem.LinearElastic, 10.0, 5e-3), (3, uem.LinearElastic, 10.0, 5e-3),
+                                                             (2, uem.NeoHooke, 1.0, 2e-2)])  # fmt: skip
+def test_a_bar_on_a_wall(dim, law, speed, within):
+    """The wall feels rho c v for the time 2 L / c; momentum is the impulse, and the energy stays."""
+    bar = Flight(dim, 40 if dim == 2 else 20, speed, 0.05 * speed, law=law)
+    t, force, energy, momentum = bar.run(0.05 + 2 * 10 / 30 + 0.1)
+    plateau = force[(t > 0.12) & (t < 0.65)]
+    cell = 10 / (40 if dim == 2 else 20) / 30
+    assert abs(plateau.mean() / (30 * speed) - 1) < within
+    on = t[force > 0]
+    assert 0.05 <= on[0] <= 0.05 + 2 * bar.last.dt and abs(on[-1] - 0.05 - 2 / 3) < 2 * cell
+    # no impulse but that of the wall
+    assert abs(momentum[-1] + 10 * speed - bar.book.impulses[-1][0][-1]) < 1e-11 * 10 * speed
+    assert np.abs(energy - 1).max() < (5e-3 if dim == 2 else 1e-2)
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("impedance", [1.0, 4.0])
+def test_bars_of_other_impedance(coupling, impedance):
+    """Force ``v Z1 Z2 / (Z1 + Z2)``, velocity of rebound by characteristics, momentum of both to rounding."""
+    bars = Flight(2, 60, 1.0, 0.05, bars=2, impedance=impedance, coupling=coupling)
+    t, force, energy, momentum = bars.run(0.05 + 2 * 10 / 30 + 0.05)
+    plateau = force[(t > 0.12) & (t < 0.65)]
+    assert abs(plateau.mean() / (30 * impedance / (1 + impedance)) - 1) < 1e-2
+    assert np.abs(momentum + 10).max() < 1e-11
+    assert np.abs(energy - 1).max() < 5e-3
+
+
+def test_the_critical_step():
+    """Lanczos' estimate is at most four per cent below the exact one, 2 over the highest frequency of the condensed system."""
+    bar = Flight(2, 12, nu=0.3)
+    stepper = ExplicitStepper(bar.problem)
+    found = stepper.critical_step()
+    if COMM.size == 1:
+        K, m = bar.problem.bodies.tangent.K[:, :], stepper._mass
+        i, s = np.flatnonzero(m > 0), np.flatnonzero(m == 0)
+        condensed = K[np.ix_(i, i)] - K[np.ix_(i, s)] @ np.linalg.solve(K[np.ix_(s, s)], K[np.ix_(s, i)])
+        root = np.sqrt(m[i])
+        highest = np.linalg.eigvalsh(condensed / root[:, None] / root)[-1]
+        assert 0.96 * 2 / np.sqrt(highest) < found <= 2 / np.sqrt(highest) * (1 + 1e-9)
+
+
+def test_stiff_contactors_do_not_shorten_steps():
+    """A thin layer of cells between surface and masses vibrates with nothing: the step is that without it, until it touches."""
+
+    def stepper(thin):
+        """Of a bar whose lowest cells are thin."""
+
+        def pose(x):
+            return x + np.outer(np.abs(x[:, 1] - 0.05) < 1e-9, [0.0, (1 - thin) * 10 / 12])
+
+        return ExplicitStepper(Flight(2, 12, gap=0.05, pose=pose).problem)
+
+    whole, thin = stepper(1.0), stepper(0.1)
+    steps = whole.critical_step(), thin.critical_step()
+    assert not whole.of_contact and thin.of_contact
+    assert steps[1] > 0.8 * steps[0]
+
+
+def test_a_step_beyond_the_critical_one():
+    """A step that is too long is refused with both lengths, before any step."""
+    bar = Flight(2, 12)
+    critical = ExplicitStepper(bar.problem).critical_step()
+    with pytest.raises(uem.InputError, match="no more than the critical step"):
+        next(iter(uem.time_steps(bar.problem, 1.01 * critical, 1.0)))
+    next(iter(uem.time_steps(bar.problem, 0.99 * critical, 1.0)))
+
+
+@pytest.mark.parametrize(("left", "steps"), [(3e-7, 1), (3e-6, 2)])
+def test_steps_that_end(left, steps):
+    """What is left to the end is a step, or rounding."""
+    assert len(list(uem.time_steps(Flight(2, 12).problem, 0.01, 0.01 * (1 + left)))) == steps
+
+
+def test_steps_that_shrink():
+    """A bar that is squeezed has shorter cells: after fifty steps they are shorter, too."""
+    bar = Flight(2, 90, law=uem.NeoHooke)
+    y = bar.problem.config.X[:, 1]
+    bar.dynamics.velocity.x.array.reshape(-1, 2)[:, 1] = 1.5 * (5.5 - y)
+    lengths = []
+    for step in uem.time_steps(bar.problem, end=100.0):
+        lengths.append(step.dt)
+        if step.number == 51:
+            break
+    assert np.ptp(lengths[:50]) == 0.0 and lengths[50] < 0.95 * lengths[0]
+
+
+def test_supports_and_gravity():
+    """A hanging bar whose end is moved follows: its momentum is that of weight and reaction, its end has the given motion."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 10.0], [1, 20])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v, moved = fem.Function(V), ufl.TestFunction(V), fem.Constant(s.mesh, 0.0)
+    top = s.tag("top", 0, at(1, 10.0))
+    bcs = [fem.dirichletbc(moved, fem.locate_dofs_topological(V.sub(1), 1, top.entities), V.sub(1)), *clamp(V, top, 0)]
+    law = uem.LinearElastic(900.0, 0.0, kind="plane_stress")
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), gravity=(0.0, -10.0), scheme=uem.CentralDifferences())
+    problem = uem.UnitedProblem(
+        law.residual(u, v) * ufl.dx, u, bcs=bcs, dynamics=dynamics, load={moved: lambda t: 0.1 * np.sin(5 * t) ** 2}
+    )
+    book, impulse, before = uem.EnergyBook(problem, law.energy(u) * ufl.dx), 0.0, None
+    for step in uem.time_steps(problem, end=0.6):
+        row = book.write(step)
+        reaction = problem.reaction(top)[1]
+        impulse += step.dt * (reaction if before is None else 0.5 * (reaction + before)) - step.dt * 100.0
+        before = reaction
+    highest = COMM.allreduce(u.x.array.max(initial=-np.inf), MPI.MAX)
+    assert highest == pytest.approx(0.1 * np.sin(3.0) ** 2)
+    assert abs(row.defect) < 1e-2 * max(r.kinetic + r.stored for r in book.rows)
+
+
+def test_it_goes_on_from_a_checkpoint(tmp_path):
+    """A run that stops during contact and goes on ends as the one that does not."""
+    path = COMM.bcast(str(tmp_path / "run.h5") if COMM.rank == 0 else None)
+    whole = Flight(2, 12)
+    whole.run(0.3)
+    first = Flight(2, 12)
+    for step in uem.time_steps(first.problem, None, 0.3, checkpoint=uem.Checkpoint(path, every=5)):
+        if step.number == 11:
+            break
+    again = Flight(2, 12)
+    steps = list(uem.time_steps(again.problem, None, 0.3, checkpoint=uem.Checkpoint(path, every=5)))
+    assert steps[0].number > 5
+    assert np.abs(again.u.x.array - whole.u.x.array).max(initial=0.0) <= 1e-12 * whole.size
+    assert np.abs(again.dynamics.velocity.x.array - whole.dynamics.velocity.x.array).max(initial=0.0) <= 1e-11 * 10
+
+
+REFUSED = {
+    "a consistent mass": ({"consistent": True}, "lumped mass"),
+    "contactors with mass": ({"dynamics": {"contactors": "massy"}}, "contactors='massy'"),
+    "damping": ({"dynamics": {"damping": lambda rate: ufl.inner(rate, rate) * ufl.dx}}, "damping does not go"),
+    "a history": ({"history": True}, "materials does not go"),
+    "a tie": ({"contact": {"tied": True}}, "is tied"),
+    "events": ({"steps": {"event_tolerance": 0.1}}, "event_tolerance"),
+    "steps taken again": ({"again": True}, "not repeated"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_does_not_go_is_refused(what):
+    """By name, before any work."""
+    how, words = REFUSED[what]
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 10.0], [1, 12]),
+                                      box("quadrilateral", [0.0, 10.0], [1.0, 20.0], [1, 12])])  # fmt: skip
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    law = (
+        uem.VonMises(u, 900.0, 0.0, 1.0, kind="plane_stress")
+        if "history" in how
+        else uem.LinearElastic(900.0, 0.0, kind="plane_stress")
+    )
+    form = law.residual(v) if "history" in how else law.residual(u, v) * ufl.dx
+    mass = (uem.consistent_mass if "consistent" in how else uem.lumped_mass)(V, 1.0)
+    contact = uem.Contact(s.tag("up", 1, at(1, 10.0)), s.tag("low", 0, at(1, 10.0)), **how.get("contact", {}))
+    with pytest.raises(uem.InputError, match=words):
+        problem = uem.UnitedProblem(
+            form, u, contacts=[contact], materials=[law] if "history" in how else [],
+            dynamics=uem.Dynamics(mass, scheme=uem.CentralDifferences(), **how.get("dynamics", {})),
+        )  # fmt: skip
+        for _ in uem.time_steps(problem, end=0.1, **how.get("steps", {})):
+            problem.solve()

@@ -1,0 +1,49 @@
+"""What does not go with explicit steps, refused by name before any work."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
+from uem_dolfinx.errors import InputError
+
+
+def is_explicit(dynamics: Any) -> bool:
+    """Whether these dynamics, or None, take explicit steps."""
+    return dynamics is not None and isinstance(dynamics.scheme, CentralDifferences)
+
+
+def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) -> None:
+    """Refuse arguments of a problem whose dynamics are explicit and do not go with them (its caller makes the ranks agree).
+
+    Args:
+        dynamics: of the problem, or None.
+        contacts: as declared.
+        others: further arguments of the problem by name, refused unless empty or False.
+
+    Raises:
+        InputError: with the argument, the reason and a remedy.
+    """
+    if not is_explicit(dynamics):
+        return
+    remedy = "leave it out, or take an implicit scheme, as uem.newmark()"
+    for name, value in others.items():
+        if value:
+            raise InputError(f"{name} does not go with CentralDifferences: {remedy}")
+    if dynamics.damping is not None:
+        raise InputError(f"damping does not go with CentralDifferences, whose steps it would shorten: {remedy}")
+    if dynamics.contactors != "massless":
+        raise InputError(
+            "contactors='massy' does not go with CentralDifferences, whose contact is exact on a surface without mass"
+        )
+    if not dynamics.mass.diagonal:
+        raise InputError(
+            "CentralDifferences divide forces by masses: expected a lumped mass; make it by uem.lumped_mass(V, density)"
+        )
+    for contact in contacts:
+        name = f"contact '{contact.name}'"
+        if getattr(contact, "tied", False):
+            raise InputError(f"{name} is tied, and its nodes have mass, which CentralDifferences move freely: {remedy}")
+        if getattr(contact, "heats", ()):
+            raise InputError(f"{name} conducts heat, which does not go with CentralDifferences: {remedy}")

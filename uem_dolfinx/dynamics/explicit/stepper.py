@@ -1,0 +1,125 @@
+"""One explicit step: nodes with mass move by central differences, then the surface without mass comes into equilibrium in contact.
+
+The surface's problem is that of a static step of the same united system, in which the nodes with mass have prescribed motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx import forms
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.dynamics.explicit.critical import highest_eigenvalue
+from uem_dolfinx.errors import MassError
+
+#: A surface at rest makes the square of the highest frequency much larger if by more than this factor: contacts then change the step.
+#: [convention; square of the highest frequency; test_explicit.py::test_stiff_contactors_do_not_shorten_steps]
+STIFF_SURFACE = 1.25
+#: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from.
+#: [format; wave numbers; -]
+IRRATIONAL = 1e3 * np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
+
+
+class ExplicitStepper:
+    """Explicit steps of a problem (collective).
+
+    Args:
+        problem: a ``UnitedProblem`` with central differences.
+
+    Raises:
+        MassError: if nothing has mass.
+    """
+
+    def __init__(self, problem: Any):
+        self.problem, self.dynamics, bodies = problem, problem.dynamics, problem.bodies
+        self._n = problem.config.n_owned * problem.config.gdim
+        m = self.dynamics.mass.of_nodes.ravel()
+        heavy = np.zeros(len(bodies.held), dtype=bool)
+        heavy[: self._n] = m > 0.0
+        #: Unknowns whose motion the masses determine, ghosts included, and of them those of this rank without conditions.
+        self.interior: Bools = bodies.of_owners(heavy)
+        self.moving: Bools = heavy[: self._n] & ~self.dynamics.held
+        if not problem.comm.allreduce(int(heavy.sum())):
+            raise MassError("central differences need nodes with mass, and there are none: check the density")
+        self._mass = m
+        #: Whether contacts change the critical step.
+        self.of_contact = False
+        self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
+
+    def begin(self) -> None:
+        """Bring the surface into equilibrium at the start, and find the first accelerations (collective)."""
+        problem, dynamics = self.problem, self.dynamics
+        # no time passes, so that any length serves
+        dynamics.begin(1.0)
+        with problem.bodies.holding(self.interior):
+            problem.attempt(start=problem.committed)
+            a = self._accelerations()
+        dynamics.restore()
+        problem.keep()
+        dynamics.change_rates(np.array(dynamics.velocity.x.array[: self._n]), a)
+        dynamics.accelerated = True
+
+    def step(self, dt: float) -> Any:
+        """Take a step of length ``dt`` and commit it; returns the history of iterations for the surface (collective)."""
+        problem, dynamics, n = self.problem, self.dynamics, self._n
+        half = dynamics.velocity.x.array[:n] + 0.5 * dt * dynamics.acceleration.x.array[:n]
+        start = np.array(problem.committed)
+        start[:n] += np.where(self.moving, dt * half, 0.0)
+        dynamics.begin(dt)
+        with problem.bodies.holding(self.interior):
+            history = problem.attempt(start=start)
+            a = self._accelerations()
+        problem.commit()
+        dynamics.change_rates(np.where(self.moving, half + 0.5 * dt * a, dynamics.velocity.x.array[:n]), a)
+        return history
+
+    def _accelerations(self) -> Array:
+        """Accelerations of the moving components under the forces of bodies and contacts, zero elsewhere ``(n,)`` (collective)."""
+        system = self.problem.system
+        return -self._inverse * system.restriction().pass_on(system.residual()).array_r
+
+    # -- critical step ---------------------------------------------------------------------------------------------------
+
+    def critical_step(self) -> float:
+        """Longest stable step in the present state, infinite without stiffness (collective).
+
+        The surface follows the masses in equilibrium: its stiffness alone does not count. If a surface at rest would hardly make the
+        frequency higher, that bound is taken, which no contact exceeds; otherwise ``of_contact`` is set, as contacts change the step.
+        """
+        problem = self.problem
+        problem.bodies.update_tangent()
+        fixed = self._highest(self._stiffness_if_fixed)
+        with problem.bodies.holding(self.interior):
+            # inertia holds the bodies, not supports
+            problem.system.floating.begin_motion()
+            system, self._P = problem.system, problem.system.restriction()
+            system.solver.set_operator(self._P, problem.bodies.tangent.K, None, self._P)
+            condensed = self._highest(self._stiffness)
+        self.of_contact = fixed > STIFF_SURFACE * condensed
+        highest = condensed if self.of_contact else fixed
+        return 2.0 / np.sqrt(highest) if highest > 0.0 else np.inf
+
+    def _highest(self, apply: Callable[[Array], Array]) -> float:
+        config, mass = self.problem.config, self._mass * self.moving
+        along = config.X[: config.n_owned] @ IRRATIONAL[: config.gdim] / config.size
+        start = np.sin(along[:, None] + np.arange(config.gdim)).ravel()
+        return highest_eigenvalue(apply, mass, start, self.problem.comm)
+
+    def _times_K(self, field: PETSc.Vec) -> PETSc.Vec:
+        return forms.product(self.problem.bodies.tangent.K, field)
+
+    def _stiffness_if_fixed(self, field: Array) -> Array:
+        """K times a field of the moving components, with all others at rest ``(n,)`` (collective)."""
+        return np.array(self._times_K(self.problem.config.unknowns.vector(field)).array_r) * self.moving
+
+    def _stiffness(self, field: Array) -> Array:
+        """``K_II - K_IS K_SS^-1 K_SI`` times a field, with the constraints of contact on the surface ``(n,)`` (collective)."""
+        P, solver = self._P, self.problem.system.solver
+        du = P.carried(field.reshape(-1, self.problem.config.gdim))
+        dq, _ = solver.solve(-P.transpose(self._times_K(du)), 0.0)
+        du.axpy(1.0, P.expand(solver.complete(dq)))
+        return np.array(P.pass_on(self._times_K(du)).array_r) * self.moving

@@ -1,0 +1,77 @@
+"""Explicit time steps: lengths by the critical step, and the loop."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import gathered
+from uem_dolfinx.solve.steps.time_step import TimeStep, events, touching
+
+#: Bodies that yield or turn have another critical step after so many steps.
+#: [convention; steps; test_explicit.py::test_steps_that_shrink]
+CHECKED_EVERY = 50
+#: What is left to the end is rounding below this part of a step.
+#: [convention; length of a step; test_explicit.py::test_steps_that_end]
+LEFT = 1e-6
+
+
+def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeStep]:
+    """The steps of ``time_steps`` with central differences.
+
+    Args:
+        problem: with central differences.
+        dt: length of all steps; None takes the longest, a part ``safety`` of the critical one.
+        end: time to reach.
+
+    Raises:
+        InputError: if ``dt`` exceeds the critical step.
+    """
+    control, dynamics, stepper = problem.step_control, problem.dynamics, ExplicitStepper(problem)
+    resumed = dt is None and dynamics.resumed and dynamics.time > dynamics.start
+    problem.set_load(dynamics.time)
+    if not dynamics.accelerated:
+        stepper.begin()
+    length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), _pattern(problem)
+    while (remainder := end - dynamics.time) > LEFT * length:
+        taken = length if remainder >= (1.0 - LEFT) * length else remainder
+        problem.set_load(dynamics.time + taken)
+        iterations = stepper.step(taken)
+        control.begin(length)
+        number, cuts = control.done(iterations)
+        after = touching(problem)
+        last = pattern
+        yield TimeStep(number, dynamics.time, taken, iterations, cuts, *events(problem, before, after))
+        before = after
+        due = not problem.bodies.linear and number % CHECKED_EVERY == 0
+        if due or (stepper.of_contact and (pattern := _pattern(problem)) != last):
+            length = _length(stepper, dt, end)
+
+
+def _pattern(problem: Any) -> tuple[int, ...]:
+    """Fingerprint of the active contactors (collective)."""
+    return tuple(gathered(problem.comm, np.array(zlib.crc32(b"".join(pair.united.tobytes() for pair in problem.interfaces)))))
+
+
+def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:
+    """Length of steps that divide the time to the end; InputError for a given one beyond the critical step (collective)."""
+    critical, dynamics = stepper.critical_step(), stepper.dynamics
+    if dt is not None:
+        if dt > critical:
+            raise InputError(
+                f"dt = {dt:.6g} at time {dynamics.time:.6g}: expected no more than the critical step {critical:.4g} of central "
+                "differences; take shorter steps, or dt=None"
+            )
+        return dt
+    longest = dynamics.scheme.safety * critical
+    remainder = end - dynamics.time
+    # the same on any ranks: rounding of the critical step does not change the number of steps
+    length = remainder / max(np.ceil(remainder / longest - LEFT), 1.0)
+    logger.debug("critical step %.6g, taken %.6g", critical, length)
+    return float(length)
