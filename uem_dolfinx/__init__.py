@@ -36,19 +36,20 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 __version__ = "0.2.0"
 
 __all__ = [
-    "Balance", "CentralDifferences", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact", "ContactParameter",
-    "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "FinitePlasticity",
-    "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError",
-    "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError",
-    "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError",
-    "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant", "ResultsWriter", "RigidCoupling",
-    "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError", "StVenantKirchhoff",
-    "State", "Step", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca",
-    "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "animate", "axisymmetric",
-    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "example_mesh", "figure", "function_space",
-    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
-    "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh",
-    "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "Adaptation", "Balance", "CentralDifferences", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact",
+    "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation",
+    "ErrorEstimate", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter", "InputError",
+    "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
+    "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError",
+    "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant", "ResultsWriter",
+    "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError",
+    "StVenantKirchhoff", "State", "Step", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError",
+    "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt",
+    "animate", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh",
+    "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
+    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
+    "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings",
+    "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -110,6 +111,8 @@ from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
 
 if _TYPE_CHECKING:
+    from uem_dolfinx.accuracy.adapt import Adaptation, adapt
+    from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
@@ -165,6 +168,8 @@ _LATER = {
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "plot_setup": "output.pictures",
+    "Adaptation": "accuracy.adapt", "adapt": "accuracy.adapt",
+    "ErrorEstimate": "accuracy.estimate", "error_estimate": "accuracy.estimate",
     "ContactParameter": "gradients.parameters",
     "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
     "History": "gradients.history", "recording": "gradients.history",

@@ -19,7 +19,8 @@ REPOSITORY = thresholds.REPOSITORY
 #: Rooms from the ground up; files import only from their own room and from those before it.
 ROOMS = [
     ("arrays", "errors", "compiled", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",),
-    ("conditions",), ("contact",), ("materials", "dynamics"), ("restart",), ("solve",), ("gradients",), ("output",), ("scripting",),
+    ("conditions",), ("contact",), ("materials", "dynamics"), ("restart",), ("solve",), ("gradients",), ("accuracy",), ("output",),
+    ("scripting",),
 ]  # fmt: skip
 #: Folders within contact/ from the ground up, and files of its own among them; ``""`` is all its other files.
 FLOORS = {
@@ -116,7 +117,7 @@ def test_imports_point_one_way():
 #: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
 BUDGETS = {
     "members of the seam": 40, "members of Interface": 94, "heuristics": 14, "arrows within contact": 64, "arrows within solve": 38,
-    "lines of the package": 46100,
+    "lines of the package": 46648,
 }  # fmt: skip
 
 

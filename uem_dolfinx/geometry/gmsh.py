@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
 from uem_dolfinx.geometry.cells import check_edges, check_nodes, check_volumes
+from uem_dolfinx.geometry.mesh_sizes import MeshSizes
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
@@ -57,7 +58,11 @@ def example_mesh(name: str) -> Path:
 
 
 def read_gmsh(
-    source: Any, comm: MPI.Comm, gdim: int | None = None, parameters: Mapping[str, float] | None = None
+    source: Any,
+    comm: MPI.Comm,
+    gdim: int | None = None,
+    parameters: Mapping[str, float] | None = None,
+    size: MeshSizes | None = None,
 ) -> tuple[Any, Tags]:
     """Read a mesh and its physical groups from Gmsh (collective).
 
@@ -70,6 +75,7 @@ def read_gmsh(
         comm: communicator of the mesh; rank 0 does the reading.
         gdim: geometric dimension, 2 or 3; by default that of the model. The coordinate ``z`` is dropped in 2D.
         parameters: numbers for the ``.geo`` file's ``DefineConstant``.
+        size: sizes of cells instead of those of the ``.geo`` file, as ``adapt`` passes them to its ``make``; None keeps the file's.
 
     Returns:
         The mesh and its tags.
@@ -86,7 +92,8 @@ def read_gmsh(
         given.kind("parameters", parameters, known, "numbers by name, as {'h': 0.1}, or None")
         for name, value in (parameters or {}).items():
             given.number(f"parameters[{name!r}]", value, given.Range("a finite number", lambda x: True))
-        return _read(source, gdim, dict(parameters or {}))
+        given.kind("size", size, size is None or isinstance(size, MeshSizes), "what adapt passes to make, or None")
+        return _read(source, gdim, dict(parameters or {}), size)
 
     return distributed(comm, read, source if isinstance(source, (str, Path)) else "gmsh model")
 
@@ -144,7 +151,7 @@ class RawMesh:
     groups: list[Group]
 
 
-def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> RawMesh:
+def _read(source: Any, gdim: int | None, parameters: dict[str, float], size: MeshSizes | None = None) -> RawMesh:
     """Read a file or a live model; Gmsh is left as it was found."""
     if gdim not in (None, 2, 3):
         raise MeshError(f"gdim is {gdim!r}: a body is of dimension 2 or 3")
@@ -152,8 +159,8 @@ def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> RawMes
         raise MeshError("the source is None on rank 0: give the path of a .geo or .msh file, or gmsh.model")
     gmsh = import_gmsh()
     if not isinstance(source, (str, Path)):
-        if parameters:
-            raise MeshError("parameters belong to a .geo file: a live gmsh.model is already built")
+        if parameters or size is not None:
+            raise MeshError("parameters and sizes belong to a .geo file: a live gmsh.model is already built")
         if not compat.gmsh_is_initialized(gmsh):
             raise MeshError("gmsh is not initialised on rank 0: call gmsh.initialize() and build the model first")
         return _extract(source, gdim, "the live gmsh.model")
@@ -162,15 +169,16 @@ def _read(source: Any, gdim: int | None, parameters: dict[str, float]) -> RawMes
         raise MeshError(f"{source} is neither a .geo nor a .msh file: uem.read_mesh reads files of other programs")
     if not path.is_file():
         raise MissingFileError(f"mesh file {source} does not exist (looked for {path})")
-    if path.suffix == ".msh" and parameters:
-        raise MeshError(f"{source} is already meshed and takes no parameters ({', '.join(parameters)}): read a .geo file")
+    if path.suffix == ".msh" and (parameters or size is not None):
+        what = ", ".join([*parameters, *(["size"] if size is not None else [])])
+        raise MeshError(f"{source} is already meshed and takes no parameters ({what}): read a .geo file")
     known = _constants(path) if parameters else []
     for name, value in parameters.items():
         if name not in known:
             raise MeshError(f"{source} has no constant {name!r}: DefineConstant declares {', '.join(known) or 'nothing'}")
         if not np.isfinite(value):
             raise MeshError(f"parameter {name!r} of {source} is {value!r}: give a finite number")
-    return _open(gmsh, path, gdim, parameters)
+    return _open(gmsh, path, gdim, parameters, size)
 
 
 def _constants(path: Path) -> list[str]:
@@ -226,7 +234,7 @@ def _whole(path: Path, folder: Path, copies: dict[Path, Path]) -> Path:
     return copies[path]
 
 
-def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float]) -> RawMesh:
+def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float], size: MeshSizes | None) -> RawMesh:
     """Open and mesh a file in a session of our own, or in a model of our own in the user's session."""
     with _session(gmsh) as errors, tempfile.TemporaryDirectory() as folder:
         # constants set before the file is included win over its DefineConstant, in this model only
@@ -239,7 +247,8 @@ def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float])
             gmsh.open(str(wrapper if parameters else source))
             dim = gdim or (3 if gmsh.model.getDimension() == 3 else 2)
             if not errors() and not len(gmsh.model.mesh.getElements(dim)[0]):
-                gmsh.model.mesh.generate(dim)
+                with nullcontext() if size is None else size.within(gmsh):
+                    gmsh.model.mesh.generate(dim)
             found = errors()
         except Exception as error:  # Gmsh raises bare Exceptions
             found = [*errors(), str(error)]

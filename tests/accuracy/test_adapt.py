@@ -1,0 +1,112 @@
+"""Meshes that follow the estimated error: orders at a sharp corner, numbers of cells, and what goes wrong.
+
+Read first: ``test_a_sharp_corner``.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import refused, slow
+
+import uem_dolfinx as uem
+from uem_dolfinx.accuracy.adapt import AdaptedMesh, enough, size_factors
+
+COMM = MPI.COMM_WORLD
+
+
+def punch(size=None, degree=2, h=0.5, quads=0):
+    """A block under a rigid flat punch, whose pressure is singular at the corner."""
+    parameters = {"h": h, "quads": quads}
+    mesh, tags = uem.read_gmsh(uem.example_mesh("adapt_punch"), COMM, gdim=2, parameters=parameters, size=size)
+    V = uem.function_space(mesh, degree, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["bottom"], 1, 0.01)]
+    contact = uem.Contact(tags["under_punch"], uem.RigidPlane((0.0, 0.0), (0.0, -1.0)), name="punch")
+    return uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+
+
+def test_a_sharp_corner():
+    """An error of 1 % takes a few hundred cells of degree 2; uniform ones of a quarter of the size have 7 % with 2,400."""
+    found = uem.adapt(punch, tolerance=0.01)
+    last = found.meshes[-1]
+    assert found.reached and last.estimate <= 0.01 and last.cells < 800
+    assert (
+        last.estimate == found.estimate.relative
+        and last.unknowns == found.problem.u.function_space.dofmap.index_map.size_global * 2
+    )
+    uniform = punch(h=0.5 / 4)
+    uniform.solve()
+    assert uem.error_estimate(uniform).relative > 0.04
+    assert "estimate" in str(found)
+
+
+@pytest.mark.parametrize("degree", [slow(1), 2])
+def test_sizes_for_a_tolerance(degree):
+    """The tolerance is met, and not by far."""
+    tolerance = (0.08, 0.02)[degree - 1]
+    found = uem.adapt(lambda size: punch(size, degree), tolerance=tolerance)
+    assert found.reached and len(found.meshes) <= 7
+    assert 0.7 * tolerance < found.estimate.relative <= tolerance
+
+
+def test_a_number_of_cells():
+    """The number is met, with a smaller error than that of as many equal cells."""
+    found = uem.adapt(punch, cells=600)
+    assert found.reached and abs(found.meshes[-1].cells / 600 - 1) < 0.15
+    uniform = punch(h=0.25)
+    uniform.solve()
+    assert found.estimate.relative < 0.2 * uem.error_estimate(uniform).relative
+
+    def mesh(cells, estimate):
+        return AdaptedMesh(cells, 0, estimate, 1, 0.0)
+
+    assert enough([mesh(100, 0.1), mesh(105, 0.095)], None, 100)
+    assert not enough([mesh(100, 0.1), mesh(105, 0.07)], None, 100)
+    assert not enough([mesh(100, 0.1), mesh(120, 0.098)], None, 100)
+    assert not enough([mesh(105, 0.095)], None, 100)
+
+
+def test_sizes_change_by_a_bounded_factor():
+    """Cells with equal shares keep their size; others grow or shrink by four at most."""
+    equal = size_factors(np.full(8, 2.0 / COMM.size), 1, 2, COMM, 16.0, None)
+    assert np.allclose(equal, 1.0)
+    assert np.allclose(size_factors(np.full(8, 1.0), 2, 2, COMM, None, 8 * COMM.size), 1.0)
+    wide = size_factors(np.array([0.0, 1e-30, 1.0, 1e30]), 1, 2, COMM, None, 1000 * COMM.size)
+    assert wide.min() == 0.25 and np.isclose(wide.max(), 4.0)
+
+
+def test_shares_after_a_change():
+    """A tolerance asks for cells whose shares, which fall with h^(2p+d), sum up to it."""
+    shares = np.array([1.0, 2.0, 4.0])
+    factors = size_factors(shares, 1, 2, COMM, 0.9 * shares.sum() * COMM.size, None)
+    after = shares * factors**4
+    number = factors**-2
+    assert np.isclose((number * after).sum(), 0.9 * shares.sum())
+    assert np.allclose(after, after[0])
+
+
+def fixed(size):
+    mesh, tags = uem.read_gmsh(uem.example_mesh("two_blocks"), COMM, gdim=2, size=size)
+    V = uem.function_space(mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["lower_bottom"]), uem.dirichlet(V, tags["upper_top"], value=(0.0, -0.05))]
+    return uem.UnitedProblem(F, u, bcs=bcs, contacts=[uem.Contact(tags["upper_bottom"], tags["lower_top"])])
+
+
+def test_what_cannot_be_adapted():
+    """Cells that the geometry fixes, and wrong arguments."""
+    refused(uem.MeshError, ["Transfinite", "cells"], lambda: uem.adapt(fixed, tolerance=1e-4))
+    refused(uem.InputError, "either a tolerance or a number", lambda: uem.adapt(punch))
+    refused(uem.InputError, "either a tolerance or a number", lambda: uem.adapt(punch, tolerance=0.1, cells=10))
+    refused(uem.InputError, "between 0 and 1", lambda: uem.adapt(punch, tolerance=5))
+    refused(uem.InputTypeError, "UnitedProblem", lambda: uem.adapt(lambda size: None, tolerance=0.1))
+    refused(uem.InputTypeError, "what adapt passes", lambda: punch(0.1))
+    short = uem.adapt(punch, tolerance=0.001, meshes=2)
+    assert not short.reached and len(short.meshes) == 2

@@ -1,0 +1,45 @@
+"""Sizes of cells for Gmsh."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+import uem_dolfinx as uem
+from uem_dolfinx.accuracy.adapt import cell_sizes
+from uem_dolfinx.geometry.mesh_sizes import MeshSizes, graded
+
+COMM = MPI.COMM_WORLD
+
+
+def test_sizes_grow_slowly():
+    """From the smallest cell of a row of lines, sizes grow by half of the way; large ones stay."""
+    vertices = np.column_stack([np.arange(10), np.arange(1, 11)])
+    points = vertices[:, :, None].astype(float)
+    sizes = np.full(10, 3.0)
+    sizes[:2] = 0.1
+    at = graded(vertices, 11, points, sizes)
+    assert np.allclose(at[:2, 0], 0.1)
+    assert at[1, 1] == pytest.approx(np.sqrt(0.1 * 3.0))
+    assert np.allclose(np.diff(at[1:6, 1]), 0.5)
+    assert at[-1, 1] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("name, gdim", [("adapt_punch", 2), ("hertz_sphere", 3)])
+def test_gmsh_follows(name, gdim):
+    """Cells of a new mesh have the sizes, whatever the partition of the first."""
+    options = {"h": 0.5} if gdim == 2 else {}
+    mesh, _ = uem.read_gmsh(uem.example_mesh(name), COMM, gdim=gdim, parameters=options)
+    sizes = cell_sizes(mesh)
+    usual = COMM.allreduce(sizes.sum()) / COMM.allreduce(len(sizes))
+    number = []
+    for factor in (1.0, 0.5):
+        finer, _ = uem.read_gmsh(
+            uem.example_mesh(name), COMM, gdim=gdim, parameters=options, size=MeshSizes(mesh, np.full(len(sizes), factor * usual))
+        )
+        own = cell_sizes(finer)
+        number.append(COMM.allreduce(len(own)))
+        assert 0.7 < COMM.allreduce(own.sum()) / number[-1] / (factor * usual) < 1.5
+    assert 0.6 * 2**gdim < number[1] / number[0] < 1.5 * 2**gdim

@@ -1,0 +1,1 @@
+"""Errors of discretisation: estimates, and meshes that follow them."""

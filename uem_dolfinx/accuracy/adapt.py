@@ -1,0 +1,212 @@
+"""adapt: solve on meshes that follow the estimated error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx import compat, forms, given
+from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import InputError, MeshError
+from uem_dolfinx.geometry.mesh_sizes import MeshSizes
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.united.newton import Iteration
+
+#: A mesh is made for this part of the tolerance, since Gmsh keeps sizes only nearly.
+#: [convention; tolerance; test_adapt.py::test_sizes_for_a_tolerance]
+AIM = 0.85
+#: Cells grow or shrink by at most this factor from one mesh to the next, since an estimate on coarse cells sees little.
+#: [convention; size of a cell; test_adapt.py::test_sizes_change_by_a_bounded_factor]
+MOST_CHANGE = 4.0
+#: A number of cells is kept if it is met to this part; then a mesh ends the search whose estimate falls by less than this part.
+#: [convention; cells, or estimate; test_adapt.py::test_a_number_of_cells]
+SAME_NUMBER = 0.15
+
+
+@dataclass(frozen=True)
+class AdaptedMesh:
+    """One mesh of an adaptation.
+
+    Attributes:
+        cells: number of cells.
+        unknowns: number of components of displacements.
+        estimate: estimated error over the displacement, in the energy norm.
+        iterations: of Newton, in all steps; 0 if ``solve`` tells none.
+        seconds: for the mesh, the solution and the estimate.
+    """
+
+    cells: int
+    unknowns: int
+    estimate: float
+    iterations: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """Result of ``adapt``.
+
+    Attributes:
+        problem: of the last mesh, solved.
+        estimate: of its error.
+        meshes: all meshes, in order.
+        reached: whether the last mesh satisfies what was wanted.
+    """
+
+    problem: UnitedProblem
+    estimate: ErrorEstimate
+    meshes: list[AdaptedMesh] = field(default_factory=list)
+    reached: bool = True
+
+    def __str__(self) -> str:
+        """A table of the meshes."""
+        lines = [f"{'cells':>9} {'unknowns':>9} {'estimate':>9} {'iterations':>10} {'seconds':>8}"]
+        for m in self.meshes:
+            lines.append(f"{m.cells:9d} {m.unknowns:9d} {100 * m.estimate:7.3g} % {m.iterations:10d} {m.seconds:8.2f}")
+        return "\n".join(lines)
+
+
+def adapt(
+    make: Callable[[MeshSizes | None], UnitedProblem],
+    *,
+    tolerance: float | None = None,
+    cells: int | None = None,
+    solve: Callable[[UnitedProblem], Any] = UnitedProblem.solve,
+    meshes: int = 10,
+) -> Adaptation:
+    """Solve a problem on meshes that follow its estimated error, finer and coarser, until it is small enough (collective).
+
+    All cells get the same share of the squared error. Gmsh meshes the user's own geometry anew with these sizes, so that curved
+    boundaries stay curved. Histories run again on every mesh.
+
+    Args:
+        make: returns the problem, made from the size of cells: ``size`` is for ``read_gmsh(..., size=size)``, None on the first mesh.
+            Curves and surfaces that the ``.geo`` file makes transfinite keep their cells.
+        tolerance: bound on the estimated error over the displacement, in the energy norm; 0.05 is 5 %.
+        cells: or the number of cells, which are spent where they serve most.
+        solve: solves a problem, e.g. ``lambda problem: list(uem.load_steps(problem, 10))``; by default in one step.
+        meshes: largest number of meshes.
+
+    Returns:
+        The last problem, its estimate, and a line for each mesh.
+
+    Raises:
+        InputError, InputTypeError: for wrong arguments, neither or both of ``tolerance`` and ``cells``, or what ``error_estimate`` refuses.
+        MeshError: if the cells do not follow the sizes, since the geometry fixes them.
+
+    Example:
+        ::
+
+            def make(size):
+                mesh, tags = uem.read_gmsh("punch.geo", MPI.COMM_WORLD, gdim=2, size=size)
+                ...
+                return uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+
+            print(uem.adapt(make, tolerance=0.02))
+    """
+    given.kind("make", make, callable(make), "a function of the size of cells that returns a UnitedProblem")
+    given.kind("solve", solve, callable(solve), "a function of the problem")
+    if (tolerance is None) == (cells is None):
+        raise InputError("adapt: expected either a tolerance or a number of cells")
+    tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))
+    cells = None if cells is None else given.count("cells", cells)
+    meshes = given.count("meshes", meshes)
+    size: MeshSizes | None = None
+    # number of cells that sizes are made for: Gmsh makes more, since cells grow slowly
+    number = cells
+    found: list[AdaptedMesh] = []
+    while True:
+        start = perf_counter()
+        problem = make(size)
+        given.kind("what make returns", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+        steps = solve(problem)
+        estimate = error_estimate(problem)
+        found.append(_measured(problem, estimate, steps, start))
+        logger.info("mesh %d: %d cells, estimated error %.3g %%", len(found), found[-1].cells, 100 * found[-1].estimate)
+        reached = enough(found, tolerance, cells)
+        if reached or len(found) == meshes:
+            return Adaptation(problem, estimate, found, reached)
+        mesh = problem.config.mesh
+        wanted = None if tolerance is None else (AIM * tolerance * estimate.norm) ** 2
+        if number is not None and cells is not None and size is not None:
+            number = max(round(number * np.clip(cells / found[-1].cells, 0.5, 2.0)), 1)
+        factors = size_factors(estimate.shares, problem.config.degree, mesh.topology.dim, mesh.comm, wanted, number)
+        _refuse_fixed(found, factors, mesh.comm)
+        size = MeshSizes(mesh, cell_sizes(mesh) * factors)
+
+
+def enough(found: list[AdaptedMesh], tolerance: float | None, cells: int | None) -> bool:
+    """Whether the last mesh has what was wanted."""
+    last = found[-1]
+    if tolerance is not None:
+        return last.estimate <= tolerance
+    assert cells is not None
+    if abs(last.cells / cells - 1) > SAME_NUMBER or len(found) < 2:
+        return False
+    return abs(found[-2].cells / cells - 1) <= SAME_NUMBER and last.estimate > (1 - SAME_NUMBER) * found[-2].estimate
+
+
+def size_factors(shares: Array, degree: int, dim: int, comm: MPI.Comm, wanted: float | None, cells: int | None) -> Array:
+    """By how much to multiply the sizes of cells, so that all new cells have the same share of the squared error (collective).
+
+    A cell's squared error falls with the power ``2 p + d`` of its size where the solution is smooth.
+
+    Args:
+        shares: shares of this rank's cells in the squared error ``(n,)``.
+        degree: p, of the displacement.
+        dim: d, of the cells.
+        comm: communicator of the mesh.
+        wanted: their sum on the new mesh, or None.
+        cells: or its number of cells.
+
+    Returns:
+        Factors ``(n,)`` between 1 / ``MOST_CHANGE`` and ``MOST_CHANGE``.
+    """
+    order = 2 * degree + dim
+    total = reduced(comm, float((shares ** (dim / order)).sum()))
+    if wanted is not None:
+        # cells * share = wanted, and cells = total / share^(dim / order)
+        share = (wanted / total) ** (order / (2 * degree)) if total else 1.0
+    else:
+        assert cells is not None
+        share = (total / cells) ** (order / dim)
+    least = share * MOST_CHANGE**-order
+    return np.asarray(np.maximum((share / np.maximum(shares, least)) ** (1 / order), 1 / MOST_CHANGE))
+
+
+def cell_sizes(mesh: Any) -> Array:
+    """Mean length of the edges of this rank's cells ``(n,)``."""
+    cell, n = compat.cell_name(mesh), mesh.topology.index_map(mesh.topology.dim).size_local
+    edges = np.array(forms.reference_topology(cell)[1])
+    x = mesh.geometry.x[compat.geometry_dofs(mesh)[:n]]
+    return np.asarray(np.linalg.norm(x[:, edges[:, 1]] - x[:, edges[:, 0]], axis=2).mean(axis=1))
+
+
+def _measured(problem: UnitedProblem, estimate: ErrorEstimate, steps: Any, start: float) -> AdaptedMesh:
+    """The figures of a mesh."""
+    config = problem.config
+    V, cells = config.u.function_space, config.mesh.topology.index_map(config.tdim).size_global
+    iterations = len(steps) - 1 if steps and isinstance(steps[0], Iteration) else 0
+    if isinstance(steps, list):
+        iterations += sum(getattr(step, "newton_iterations", 0) for step in steps)
+    unknowns = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
+    return AdaptedMesh(int(cells), int(unknowns), estimate.relative, iterations, perf_counter() - start)
+
+
+def _refuse_fixed(found: list[AdaptedMesh], factors: Array, comm: MPI.Comm) -> None:
+    """Refuse cells that stay as they are though other sizes were wanted (collective)."""
+    most = reduced(comm, float(np.abs(np.log(factors)).max(initial=0.0)), op=MPI.MAX)
+    if len(found) > 1 and found[-1].cells == found[-2].cells and most > np.log(2.0):
+        raise MeshError(
+            f"the mesh has {found[-1].cells} cells again, whatever the sizes: leave Transfinite out of the .geo file where cells are to "
+            "follow the error, and pass size on to read_gmsh"
+        )

@@ -1,0 +1,114 @@
+"""error_estimate: the error of a solution by its mesh, in the energy norm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mpi4py import MPI
+
+import numpy as np
+from dolfinx import fem
+
+from uem_dolfinx import compat, forms, given
+from uem_dolfinx.accuracy.enriched import Enriched
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.bodies import body_sums, find_bodies
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.problem import UnitedProblem
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """An estimate of the error of the displacement by the mesh, in the energy norm ``sqrt(e' K e)``.
+
+    Attributes:
+        total: of all bodies, the root of a work.
+        norm: energy norm of the displacement itself, ``sqrt(u' K u)``.
+        of_bodies: estimate of each body ``(n_bodies,)``, in the order in which their cells come in the mesh's input.
+        cells: estimate of each cell, a Function that is constant in cells, for files and pictures.
+        shares: squared estimates of this rank's cells ``(n_owned_cells,)``.
+    """
+
+    total: float
+    norm: float
+    of_bodies: Array
+    cells: fem.Function = field(repr=False)
+    shares: Array = field(repr=False)
+
+    @property
+    def relative(self) -> float:
+        """Estimate over the norm of the displacement; NaN without displacement."""
+        return self.total / self.norm if self.norm else float("nan")
+
+    def __str__(self) -> str:
+        """The estimate in per cent."""
+        return f"error by the mesh: {100 * self.relative:.3g} %"
+
+
+def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
+    """Estimate the error of a solution by its mesh (collective).
+
+    The residual of the solution is evaluated in a space of one degree more, with the contact tractions on both sides; see
+    ``accuracy.enriched``. Any law, with history too, large strain and sliding, friction, and both couplings are included. The
+    estimate is of the last step alone; errors of earlier steps in a history, and of steps of time, are not included.
+
+    Args:
+        problem: in statics, in equilibrium, as ``solve`` or a step leaves it.
+
+    Returns:
+        The estimate, in total, by body and by cell.
+
+    Raises:
+        InputError, InputTypeError: for other objects, dynamics, mixed or scalar fields, or equations between nodes.
+
+    Example:
+        ::
+
+            problem.solve()
+            estimate = uem.error_estimate(problem)
+            print(estimate)
+            uem.plot_scene(problem, field=estimate.cells)
+    """
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    with agreed(problem.comm):
+        _refuse(problem)
+    config = problem.config
+    with timed("estimate errors"):
+        enriched = Enriched(problem)
+        squared = enriched.energies()
+        sums = _by_body(problem, squared)
+        cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="error_estimate")
+        cells.x.array[: len(squared)] = np.sqrt(squared)
+        cells.x.scatter_forward()
+    return ErrorEstimate(float(np.sqrt(sums.sum())), float(np.sqrt(enriched.energy)), np.sqrt(sums), cells, squared)
+
+
+def _by_body(problem: UnitedProblem, values: Array) -> Array:
+    """Sums of cells' values over each body, in the order of the mesh's input (collective)."""
+    config = problem.config
+    body, count = find_bodies(config)
+    of_cells = body[compat.cell_dofs(config.u.function_space)[: len(values), 0]]
+    first, number = np.full(count, np.iinfo(np.int64).max), forms.original_cells(config.mesh)[: len(values)]
+    np.minimum.at(first, of_cells[: len(number)], number)
+    order = np.argsort(reduced(config.comm, first, op=MPI.MIN), kind="stable")
+    return body_sums(config.comm, values[:, None], of_cells, count)[order, 0]
+
+
+def _refuse(problem: UnitedProblem) -> None:
+    """Refuse problems whose residual is more than a form of the displacement, or not in equilibrium."""
+    for present, what in (
+        (not problem.config.moves or problem.config.unknowns.mixed, "other fields than a displacement"),
+        (problem.dynamics is not None, "inertia"),
+        (bool(problem.equations), "equations between nodes"),
+        (any(one.distribute for one in problem.couplings), "couplings that distribute forces"),
+        (bool(problem.points) and problem.config.degree > 1, "forces or springs at points, which are nodes of degree 2"),
+        (problem.bodies.dead is not None, "forces that a step has not released yet"),
+    ):
+        if present:
+            raise InputError(
+                f"the problem has {what}: an estimate of its error expects forms of a displacement alone, in statics"
+            )
+    if not problem.progress.steps:
+        raise InputError("the problem has no step yet: expected a solution, whose error is estimated")

@@ -1,0 +1,98 @@
+"""Sizes of cells for Gmsh, given on the cells of another mesh of the same bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Ints
+
+#: Gmsh's types of list-based views with scalars at the vertices of a cell.
+VIEWS = {"triangle": "ST", "quadrilateral": "SQ", "tetrahedron": "SS", "hexahedron": "SH"}
+#: Sizes grow by at most this part of the way from one cell to the next, so that cells have good shapes.
+#: [convention; size over distance; test_mesh_sizes.py::test_sizes_grow_slowly]
+GROWTH = 0.5
+#: Options of Gmsh by which other sizes would count.
+OTHERS = ("Mesh.MeshSizeExtendFromBoundary", "Mesh.MeshSizeFromPoints", "Mesh.MeshSizeFromCurvature")
+
+
+class MeshSizes:
+    """Lengths of edges that Gmsh is to give cells, linear in the cells of an earlier mesh (collective).
+
+    Args:
+        mesh: the earlier mesh.
+        sizes: at its owned cells ``(n,)``, lengths.
+
+    Attributes:
+        cell: name of the earlier mesh's cells.
+        points: their vertices on rank 0 ``(m, n_vertices, gdim)``; empty on other ranks.
+        values: sizes there ``(m, n_vertices)``.
+    """
+
+    def __init__(self, mesh: Any, sizes: Array):
+        self.cell = compat.cell_name(mesh)
+        n, n_vertices = len(sizes), len(forms.reference_topology(self.cell)[0])
+        local = compat.geometry_dofs(mesh)[:n, :n_vertices]
+        number = mesh.geometry.index_map().local_to_global(local.ravel()).reshape(local.shape)
+        x = mesh.geometry.x[local][:, :, : mesh.geometry.dim]
+        found = [mesh.comm.gather(part) for part in (number, x, sizes)]
+        numbers, self.points, sizes = (
+            np.concatenate(parts) if parts else part[:0] for parts, part in zip(found, (number, x, sizes))
+        )
+        self.values: Array = np.zeros((0, n_vertices))
+        if mesh.comm.rank == 0:
+            self.values = graded(*_unique(numbers), self.points, sizes)
+
+    @contextmanager
+    def within(self, gmsh: Any) -> Iterator[None]:
+        """Mesh with these sizes, on rank 0."""
+        before = {name: gmsh.option.getNumber(name) for name in OTHERS}
+        view = gmsh.view.add("sizes")
+        m, n_vertices, gdim = self.points.shape
+        x = np.zeros((m, 3, n_vertices))
+        x[:, :gdim] = self.points.transpose(0, 2, 1)
+        data = np.concatenate([x.reshape(m, -1), self.values], axis=1)
+        gmsh.view.addListData(view, VIEWS[self.cell], m, data.ravel().tolist())
+        field = gmsh.model.mesh.field.add("PostView")
+        gmsh.model.mesh.field.setNumber(field, "ViewTag", view)
+        gmsh.model.mesh.field.setAsBackgroundMesh(field)
+        try:
+            for name in OTHERS:
+                gmsh.option.setNumber(name, 0)
+            yield
+        finally:
+            for name, value in before.items():
+                gmsh.option.setNumber(name, value)
+            gmsh.view.remove(view)
+
+
+def _unique(numbers: Ints) -> tuple[Ints, int]:
+    """Vertices of cells ``(m, k)`` counted without gaps, and how many there are."""
+    known, inverse = np.unique(numbers, return_inverse=True)
+    return inverse.reshape(numbers.shape), len(known)
+
+
+def graded(vertices: Ints, count: int, points: Array, sizes: Array) -> Array:
+    """Sizes at the vertices of cells ``(m, k)``, which grow slowly from the smallest ones.
+
+    Args:
+        vertices: of every cell ``(m, k)``.
+        count: number of all vertices.
+        points: of the vertices of every cell ``(m, k, gdim)``.
+        sizes: of every cell ``(m,)``.
+    """
+    k = vertices.shape[1]
+    logs = np.bincount(vertices.ravel(), np.repeat(np.log(sizes), k), count)
+    at = np.exp(logs / np.bincount(vertices.ravel(), minlength=count))
+    ways = np.linalg.norm(points[:, :, None] - points[:, None, :], axis=3) * GROWTH
+    while True:
+        most = at[vertices][:, :, None] + ways
+        less = at.copy()
+        np.minimum.at(less, np.broadcast_to(vertices[:, None, :], most.shape).ravel(), most.ravel())
+        if (less >= at * (1 - GROWTH * np.finfo(float).eps)).all():
+            return np.asarray(at[vertices])
+        at = less
