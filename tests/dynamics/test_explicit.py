@@ -113,6 +113,30 @@ def test_bars_of_other_impedance(coupling, impedance):
     assert np.abs(energy - 1).max() < 5e-3
 
 
+def test_a_block_slides_where_it_bounces():
+    """A block thrown aslant onto a rough plane: friction takes mu times the normal impulse; it ends as by the trapezoidal rule."""
+
+    def thrown(dt, **how):
+        s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.002], [2.0, 1.002], [16, 12])])
+        V = compat.function_space(s.mesh, 1, (2,))
+        u, v = fem.Function(V), ufl.TestFunction(V)
+        law = uem.LinearElastic(1000.0, 0.3, kind="plane_strain")
+        dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=(0.5, -0.1), gravity=(0.0, -1.0), **how)
+        contact = uem.Contact(s.tag("bottom", 0, at(1, 0.002)), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)), friction=0.3)
+        problem = uem.UnitedProblem(law.residual(u, v) * ufl.dx, u, contacts=[contact], dynamics=dynamics)
+        book = uem.EnergyBook(problem, law.energy(u) * ufl.dx)
+        for step in uem.time_steps(problem, dt, 0.2):
+            book.write(step)
+        return book
+
+    book, other = thrown(None, scheme=uem.CentralDifferences()), thrown(0.002)
+    impulse, momenta, row = book.impulses[-1][0], np.array(book.momenta), book.rows[-1]
+    assert abs(impulse[0] / impulse[1] + 0.3) < 1e-9
+    assert np.allclose(momenta[-1] - momenta[0], impulse - [0.0, 2.0 * row.time], rtol=0, atol=1e-9)
+    assert np.allclose(impulse, other.impulses[-1][0], rtol=3e-2)
+    assert abs(row.friction / other.rows[-1].friction - 1) < 3e-2 and abs(row.defect) < 5e-3 * book.rows[0].kinetic
+
+
 def test_the_critical_step():
     """Lanczos' estimate is at most four per cent below the exact one, 2 over the highest frequency of the condensed system."""
     bar = Flight(2, 12, nu=0.3)

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.explicit.critical import highest_eigenvalue
+from uem_dolfinx.dynamics.explicit.surface import SurfaceSolver
 from uem_dolfinx.errors import MassError
 
 #: A surface at rest makes the square of the highest frequency much larger if by more than this factor: contacts then change the step.
@@ -46,6 +47,7 @@ class ExplicitStepper:
         if not problem.comm.allreduce(int(heavy.sum())):
             raise MassError("central differences need nodes with mass, and there are none: check the density")
         self._mass = m
+        self.surface = SurfaceSolver(problem)
         #: Whether contacts change the critical step.
         self.of_contact = False
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
@@ -66,13 +68,16 @@ class ExplicitStepper:
     def step(self, dt: float) -> Any:
         """Take a step of length ``dt`` and commit it; returns the history of iterations for the surface (collective)."""
         problem, dynamics, n = self.problem, self.dynamics, self._n
+        # the surface, without acceleration, starts with its last velocity
         half = dynamics.velocity.x.array[:n] + 0.5 * dt * dynamics.acceleration.x.array[:n]
         start = np.array(problem.committed)
-        start[:n] += np.where(self.moving, dt * half, 0.0)
+        start[:n] += dt * half
         dynamics.begin(dt)
         with problem.bodies.holding(self.interior):
+            self.surface.predict(start)
             history = problem.attempt(start=start)
             a = self._accelerations()
+        self.surface.learn(history)
         problem.commit()
         dynamics.change_rates(np.where(self.moving, half + 0.5 * dt * a, dynamics.velocity.x.array[:n]), a)
         return history
@@ -80,7 +85,7 @@ class ExplicitStepper:
     def _accelerations(self) -> Array:
         """Accelerations of the moving components under the forces of bodies and contacts, zero elsewhere ``(n,)`` (collective)."""
         system = self.problem.system
-        return -self._inverse * system.restriction().pass_on(system.residual()).array_r
+        return -self._inverse * system.rows.test.pass_on(system.residual()).array_r
 
     # -- critical step ---------------------------------------------------------------------------------------------------
 

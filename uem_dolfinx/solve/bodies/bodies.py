@@ -92,6 +92,8 @@ class Bodies:
         self._b = compat.create_vector(self.u.function_space)
         self._u = compat.petsc_vector(self.u)
         self._n_owned = len(self._b.array_r)
+        #: Unknowns at which the residual is assembled under the present loads ``(n,)``, for the next call of ``assemble``; or None.
+        self._assembled_at: Array | None = None
         self.hold(bcs)
         self.dead: Array | None = None
         if dynamics is not None:
@@ -120,6 +122,11 @@ class Bodies:
 
     def assemble(self) -> bool:
         """Assemble the residual ``F(u)`` at the present displacement; whether it is finite on all ranks (collective)."""
+        if self._assembled_at is not None:
+            same = reduced(self.comm, bool(np.array_equal(self._assembled_at, self.u.x.array)), op=MPI.LAND)
+            self._assembled_at = None
+            if same:
+                return True
         try:
             for material in self.materials:
                 material.update()
@@ -362,6 +369,20 @@ class Bodies:
             held = np.flatnonzero(self.held[: self._n_owned])
             self._u.array[held] = self.wanted[held]
         self.u.x.scatter_forward()
+
+    def move(self, du: PETSc.Vec) -> bool:
+        """Add an increment to the displacement, with its residual; whether it is finite on all ranks (collective).
+
+        The residual is not assembled again: that of linear bodies, just assembled, changes by ``K du``.
+        """
+        self._u.array[:] += self.config.from_rows(du.array_r)
+        self.u.x.scatter_forward()
+        if self.linear:
+            self.tangent.update()
+            self._b.array[:] += self.config.from_rows(forms.product(self.tangent.K, du).array_r)
+        finite = self.linear or self.assemble()
+        self._assembled_at = np.array(self.u.x.array)
+        return finite
 
     def inverted(self) -> str | None:
         """Position of an inverted cell, or None (collective)."""

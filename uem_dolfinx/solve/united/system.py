@@ -92,6 +92,7 @@ class BodySystem:
         from uem_dolfinx.solve.bodies.far_apart import FarApart
 
         self.pairs, self.linear = list(pairs), linear
+        self.rows: Rows | None = None  # equations of the last state
         self._here: Rows | None = None  # equations at the last projection, with its slip directions; None until needed
         self._look()
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
@@ -224,6 +225,7 @@ class BodySystem:
                 rows = self._rows()
                 residual = rows.test.transpose(self.residual())
         trial, added, held, active, gap = self._trial_of(rows)
+        self.rows = rows
         torn = max([heat.torn() for heat in self._heats], default=0.0)
         return BodyState(
             trial=trial,
@@ -270,8 +272,7 @@ class BodySystem:
         gaps += [] if self.linear is None else [self.linear.largest_gap_here()]
         united = sum(int(pair.united.sum()) for pair in self.near)
         told = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
-        terms = slip_terms(self.near, self.unknowns.vector(), self.linear)
-        return trial, *terms, int(told[:, 0].sum()), float(told[:, 1].max())
+        return trial, *slip_terms(self.near, self.unknowns.vector(), self.linear), int(told[:, 0].sum()), float(told[:, 1].max())
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state with an active set changed where gaps and forces, both to first order, violate contact conditions (collective)."""
@@ -377,8 +378,7 @@ class BodySystem:
             self.place()
             self.bodies.assemble()
             self.floating.begin_motion()
-            Q, F = self.restriction(), self.residual()
-            dynamics.accelerate(Q, F, added_mass(self.linear, F))
+            dynamics.accelerate(self.restriction(), F := self.residual(), added_mass(self.linear, F))
             if self.linear is not None:
                 self.linear.settle(dynamics)
 
