@@ -102,7 +102,7 @@ def fixed(size):
 
 def test_what_cannot_be_adapted():
     """Cells that the geometry fixes, and wrong arguments."""
-    refused(uem.MeshError, ["Transfinite", "cells"], lambda: uem.adapt(fixed, tolerance=1e-4))
+    refused(uem.MeshError, ["Transfinite", "same 80 cells"], lambda: uem.adapt(fixed, tolerance=1e-4))
     refused(uem.InputError, "either a tolerance or a number", lambda: uem.adapt(punch))
     refused(uem.InputError, "either a tolerance or a number", lambda: uem.adapt(punch, tolerance=0.1, cells=10))
     refused(uem.InputError, "between 0 and 1", lambda: uem.adapt(punch, tolerance=5))

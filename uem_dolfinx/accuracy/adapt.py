@@ -19,6 +19,7 @@ from uem_dolfinx.geometry.mesh_sizes import MeshSizes
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.steps.load_steps import load_steps
 from uem_dolfinx.solve.united.newton import Iteration
 
 #: A mesh is made for this part of the tolerance, since Gmsh keeps sizes only nearly.
@@ -80,7 +81,7 @@ def adapt(
     *,
     tolerance: float | None = None,
     cells: int | None = None,
-    solve: Callable[[UnitedProblem], Any] = UnitedProblem.solve,
+    solve: Callable[[UnitedProblem], Any] | None = None,
     meshes: int = 10,
 ) -> Adaptation:
     """Solve a problem on meshes that follow its estimated error, finer and coarser, until it is small enough (collective).
@@ -93,7 +94,7 @@ def adapt(
             Curves and surfaces that the ``.geo`` file makes transfinite keep their cells.
         tolerance: bound on the estimated error over the displacement, in the energy norm; 0.05 is 5 %.
         cells: or the number of cells, which are spent where they serve most.
-        solve: solves a problem, e.g. ``lambda problem: list(uem.load_steps(problem, 10))``; by default in one step.
+        solve: solves a problem, e.g. ``lambda problem: list(uem.load_steps(problem, 10))``; by default in one load step.
         meshes: largest number of meshes.
 
     Returns:
@@ -114,34 +115,44 @@ def adapt(
             print(uem.adapt(make, tolerance=0.02))
     """
     given.kind("make", make, callable(make), "a function of the size of cells that returns a UnitedProblem")
-    given.kind("solve", solve, callable(solve), "a function of the problem")
+    given.kind("solve", solve, solve is None or callable(solve), "a function of the problem, or None")
     if (tolerance is None) == (cells is None):
         raise InputError("adapt: expected either a tolerance or a number of cells")
     tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))
     cells = None if cells is None else given.count("cells", cells)
     meshes = given.count("meshes", meshes)
     size: MeshSizes | None = None
-    # number of cells that sizes are made for: Gmsh makes more, since cells grow slowly
-    number = cells
+    # Gmsh makes fewer cells in space, and more where they have to grow slowly
+    expected, scale, whole = 0.0, 1.0, 0.0
     found: list[AdaptedMesh] = []
     while True:
         start = perf_counter()
         problem = make(size)
         given.kind("what make returns", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
-        steps = solve(problem)
+        steps = list(load_steps(problem, 1)) if solve is None else solve(problem)
         estimate = error_estimate(problem)
         found.append(_measured(problem, estimate, steps, start))
         logger.info("mesh %d: %d cells, estimated error %.3g %%", len(found), found[-1].cells, 100 * found[-1].estimate)
         reached = enough(found, tolerance, cells)
         if reached or len(found) == meshes:
+            if not reached:
+                logger.warning("%d meshes do not reach what adapt was asked for: allow more meshes, or a larger error", meshes)
             return Adaptation(problem, estimate, found, reached)
         mesh = problem.config.mesh
         wanted = None if tolerance is None else (AIM * tolerance * estimate.norm) ** 2
-        if number is not None and cells is not None and size is not None:
-            number = max(round(number * np.clip(cells / found[-1].cells, 0.5, 2.0)), 1)
-        factors = size_factors(estimate.shares, problem.config.degree, mesh.topology.dim, mesh.comm, wanted, number)
-        _refuse_fixed(found, factors, mesh.comm)
-        size = MeshSizes(mesh, cell_sizes(mesh) * factors)
+        if size is not None:
+            scale *= float(np.clip(found[-1].cells / expected, 0.5, 2.0)) ** (1.0 / mesh.topology.dim)
+            scale = scale if tolerance is None else min(scale, 1.0)
+        factors = size_factors(estimate.shares, problem.config.degree, mesh.topology.dim, mesh.comm, wanted, cells)
+        lengths = cell_sizes(mesh)
+        before, whole = whole, reduced(mesh.comm, float(lengths.sum()))
+        if before == whole and reduced(mesh.comm, float(np.abs(np.log(factors)).max(initial=0.0)), op=MPI.MAX) > np.log(2.0):
+            raise MeshError(
+                f"the mesh has the same {found[-1].cells} cells again, whatever the sizes: leave Transfinite out of the .geo file where "
+                "cells are to follow the error, and pass size on to read_gmsh"
+            )
+        expected = reduced(mesh.comm, float((factors**-mesh.topology.dim).sum()))
+        size = MeshSizes(mesh, lengths * factors * scale)
 
 
 def enough(found: list[AdaptedMesh], tolerance: float | None, cells: int | None) -> bool:
@@ -200,13 +211,3 @@ def _measured(problem: UnitedProblem, estimate: ErrorEstimate, steps: Any, start
         iterations += sum(getattr(step, "newton_iterations", 0) for step in steps)
     unknowns = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
     return AdaptedMesh(int(cells), int(unknowns), estimate.relative, iterations, perf_counter() - start)
-
-
-def _refuse_fixed(found: list[AdaptedMesh], factors: Array, comm: MPI.Comm) -> None:
-    """Refuse cells that stay as they are though other sizes were wanted (collective)."""
-    most = reduced(comm, float(np.abs(np.log(factors)).max(initial=0.0)), op=MPI.MAX)
-    if len(found) > 1 and found[-1].cells == found[-2].cells and most > np.log(2.0):
-        raise MeshError(
-            f"the mesh has {found[-1].cells} cells again, whatever the sizes: leave Transfinite out of the .geo file where cells are to "
-            "follow the error, and pass size on to read_gmsh"
-        )

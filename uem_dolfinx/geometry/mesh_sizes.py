@@ -16,8 +16,11 @@ VIEWS = {"triangle": "ST", "quadrilateral": "SQ", "tetrahedron": "SS", "hexahedr
 #: Sizes grow by at most this part of the way from one cell to the next, so that cells have good shapes.
 #: [convention; size over distance; test_mesh_sizes.py::test_sizes_grow_slowly]
 GROWTH = 0.5
-#: Options of Gmsh by which other sizes would count.
-OTHERS = ("Mesh.MeshSizeExtendFromBoundary", "Mesh.MeshSizeFromPoints", "Mesh.MeshSizeFromCurvature")
+#: Options of Gmsh by which other sizes would count, and values by which they do not.
+OTHERS = {
+    "Mesh.MeshSizeExtendFromBoundary": 0.0, "Mesh.MeshSizeFromPoints": 0.0, "Mesh.MeshSizeFromCurvature": 0.0, "Mesh.MeshSizeMin": 0.0,
+    "Mesh.MeshSizeMax": 1e22, "Mesh.MeshSizeFactor": 1.0,
+}  # fmt: skip
 
 
 class MeshSizes:
@@ -61,8 +64,8 @@ class MeshSizes:
         gmsh.model.mesh.field.setNumber(field, "ViewTag", view)
         gmsh.model.mesh.field.setAsBackgroundMesh(field)
         try:
-            for name in OTHERS:
-                gmsh.option.setNumber(name, 0)
+            for name, value in OTHERS.items():
+                gmsh.option.setNumber(name, value)
             yield
         finally:
             for name, value in before.items():
