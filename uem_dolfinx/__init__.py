@@ -43,13 +43,13 @@ __all__ = [
     "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError",
     "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant", "ResultsWriter",
     "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError",
-    "StVenantKirchhoff", "State", "Step", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError",
-    "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt",
-    "animate", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh",
-    "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
-    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
-    "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings",
-    "write_checkpoint",
+    "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags",
+    "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce",
+    "VonMises", "adapt", "animate", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate",
+    "example_mesh", "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass",
+    "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup",
+    "read_checkpoint", "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing",
+    "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -94,6 +94,7 @@ from uem_dolfinx.errors import (
     PenetrationError,
     PrecisionError,
     SpaceError,
+    StepAccuracyError,
     SurfaceError,
     TagError,
     ThrownBodyError,

@@ -82,6 +82,10 @@ class ThrownBodyError(FloatingBodyError):
     """A body held by contact has lost contact within a step and moved far, so that its position of rest is undetermined."""
 
 
+class StepAccuracyError(UEMError, RuntimeError):
+    """The error of a time step exceeds the tolerance."""
+
+
 class MassError(UEMError, ValueError):
     """A mass is unsuitable for its use."""
 

@@ -290,6 +290,20 @@ class Dynamics(given.Sealed):
         for one in self.added:
             one.leave()
 
+    def rate_error(self) -> tuple[float, float]:
+        """Local error of a step over its length, and the final speed, in the norm of M (collective).
+
+        The displacement's error is ``(beta - 1/6) dt^2 (a(n+1) - a(n))`` [O. C. Zienkiewicz, Y. M. Xie, Earthquake Engineering and
+        Structural Dynamics 20 (1991) 871-887].
+        """
+        assert isinstance(self.scheme, Scheme)
+        n, du = self._n, (self._displacement - self._u)[: self._n]
+        jump = self._a_rate * du + (self._a_past - self._acceleration)[:n]
+        speed = self._v_rate * du + self._v_past[:n]
+        jump[self.held] = 0.0
+        error, v = (self._like(part) for part in ((self.scheme.beta - 1 / 6) * self.dt * jump, speed))
+        return tuple(float(np.sqrt(max(part.dot(self.mass.M * part), 0.0))) for part in (error, v))  # type: ignore[return-value]
+
     @contextmanager
     def without_inertia(self) -> Iterator[None]:
         """Context in which the tangent has no mass and no damping."""

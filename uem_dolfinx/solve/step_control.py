@@ -24,7 +24,7 @@ REMAINDER = 1e-9
 #: Errors that a shorter step may avoid.
 MENDABLE = (
     errors.ConvergenceError, errors.LinearSolveError, errors.NotFiniteError, errors.InvertedElementError,
-    errors.TunnellingError, errors.EnergyGivenError, errors.ThrownBodyError, errors.OverdeterminedError,
+    errors.TunnellingError, errors.EnergyGivenError, errors.ThrownBodyError, errors.OverdeterminedError, errors.StepAccuracyError,
 )  # fmt: skip
 
 
@@ -38,10 +38,11 @@ class StepControl:
         longest: bound on the length of the next step.
         number: number of completed steps.
         largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
+        largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
     """
 
     def __init__(self, nominal: float = 1.0):
-        self.nominal, self.longest, self.number, self.largest_energy = nominal, np.inf, 0, 0.0
+        self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
         self._cuts, self._read, self._longest_before = 0, False, np.inf
 
     def begin(self, nominal: float) -> None:
@@ -75,9 +76,14 @@ class StepControl:
         """After a final failure, reset the length to its value before the failed step."""
         self.longest = self._longest_before
 
-    def done(self, iterations: Sequence[object]) -> tuple[int, int]:
-        """Count a step that converged with this history; returns its number and the number of its cuts."""
-        if len(iterations) - 1 <= EASY:
+    def done(self, iterations: Sequence[object], longer: bool = True) -> tuple[int, int]:
+        """Count a step that converged with this history; returns its number and the number of its cuts.
+
+        Args:
+            iterations: the history.
+            longer: whether the next step may be longer if this one was easy.
+        """
+        if len(iterations) - 1 <= EASY and longer:
             self.longest *= 2.0
         self._longest_before = self.longest
         cuts, self._cuts, self.number = self._cuts, 0, self.number + 1
@@ -86,9 +92,12 @@ class StepControl:
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers for a checkpoint, by name."""
         kept = {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
-        return kept | {"nominal length": self.nominal}
+        return kept | {"nominal length": self.nominal, "largest speed": self.largest_speed}
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
-        self.number, self.longest, self.largest_energy, self.nominal = (kept[name] for name in self.to_checkpoint())
+        # files of earlier versions have no speed
+        self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed = (
+            kept.get(name, 0.0) for name in self.to_checkpoint()
+        )
         self._read, self._longest_before = True, self.longest

@@ -15,7 +15,7 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, UEMError
+from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem, check_steps
@@ -36,6 +36,9 @@ TIME_ROUNDING = 4 * np.finfo(float).eps
 #: in the surfaces that they press.
 #: [convention; energies at work; test_thresholds_motion.py::test_energy_given]
 MOST_GIVEN = 2e-3
+#: The error of a step over its length grows so much if the length doubles.
+#: [derived; error over length; test_accuracy_in_time.py::test_steps_are_doubled_in_time]
+ORDER_TWO = 4.0
 #: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
 #: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
 SHORTEST_GIVEN = 1.0 / 128
@@ -46,6 +49,7 @@ def time_steps(
     dt: float | None = None,
     end: float | None = None,
     *,
+    tolerance: float | None = None,
     event_tolerance: float | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Iterator[TimeStep]:
@@ -58,6 +62,9 @@ def time_steps(
         problem: with ``dynamics``; its ``load`` is called with the time.
         dt: nominal length of the steps; with ``CentralDifferences`` None chooses the longest ones that are safe.
         end: time to reach.
+        tolerance: shorten steps to dt/2, dt/4, ... until the local error of a step is below this part of the way that the bodies move in
+            it at their largest speed so far, and lengthen them again up to ``dt`` where it is much smaller; see
+            ``Dynamics.rate_error``. The period of a vibration has about this error. None: steps have the length ``dt``.
         event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``. The step is divided there, so
             that a step begins at the instant, unless rounding exceeds the forces of such short steps. None: steps are not divided.
         checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
@@ -73,6 +80,7 @@ def time_steps(
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.
         EnergyGivenError: if impact adds energy to the bodies even in the shortest step.
+        StepAccuracyError: if the error exceeds the tolerance even in the shortest step.
         ConvergenceError: if a step fails even at 1/1024 of its nominal length; the last converged state is kept.
         LinearSolveError, NotFiniteError, InvertedElementError: if a step fails even at 1/1024 of its nominal length.
         KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM; the last converged state is kept.
@@ -87,16 +95,19 @@ def time_steps(
         end = given.number("end", end, _not_before(dynamics.start))
         if is_explicit(dynamics) and event_tolerance is not None:
             raise InputError("event_tolerance is for implicit schemes: leave it out, since explicit steps are short")
+        if is_explicit(dynamics) and tolerance is not None:
+            raise InputError("tolerance is for implicit schemes: leave it out, since explicit steps are short")
+        tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))
         if event_tolerance is not None:
             event_tolerance = given.number("event_tolerance", event_tolerance, given.between(0.0, 1.0))
-    given.alike(problem.comm, "time_steps", dt=dt, end=end, event_tolerance=event_tolerance)
+    given.alike(problem.comm, "time_steps", dt=dt, end=end, tolerance=tolerance, event_tolerance=event_tolerance)
     if dt is not None:
         _check_length(dynamics, dt, end)
     begin_checkpoint(checkpoint, problem.state, problem.config.functions()["displacement"])
     steps, total = explicit_steps(problem, dt, end), None
     if not is_explicit(dynamics):
         assert dt is not None
-        steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt)
+        steps = _time_steps(problem, dynamics, dt, end, event_tolerance and event_tolerance * dt, tolerance)
         total = max(0, round((end - dynamics.time) / dt))
     shown = progress(steps, "time steps", total=total)
     return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.declared)
@@ -116,8 +127,10 @@ def _check_length(dynamics: Dynamics, dt: float, end: float) -> None:
         )
 
 
-def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None) -> Iterator[TimeStep]:
-    """The steps of ``time_steps``."""
+def _time_steps(
+    problem: UnitedProblem, dynamics: Dynamics, dt: float, end: float, tolerance: float | None, accuracy: float | None
+) -> Iterator[TimeStep]:
+    """The steps of ``time_steps``, with instants of contact to a tolerance, and of an accuracy."""
     control = problem.step_control
     control.begin(dt)
     problem.set_load(dynamics.time)
@@ -127,14 +140,17 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
         problem.history.note_start()
     before, rounding = touching(problem), _rounding(dynamics, dt, end)
     while (remainder := end - dynamics.time) > rounding:
-        # to the next multiple of dt; whole steps have equal lengths to the last bit, so that K does not change
+        # to the next multiple of dt; whole steps, and steps of a half and so on, have equal lengths to the last bit: K does not change
         passed = (dynamics.time - dynamics.start) / dt
         rest = min((np.floor(passed + rounding / dt) + 1.0 - passed) * dt, remainder)
-        length = min(control.longest, dt if abs(rest - dt) <= rounding else rest)
+        shortest = SHORTEST_LENGTH * dt
+        parts = np.round(rest / shortest)
+        length = min(control.longest, float(parts * shortest) if abs(rest - parts * shortest) <= rounding else rest)
         try:
             forces = _contact_forces(problem)
             length, iterations = _step(problem, length, before, tolerance)
             _refuse_given_energy(problem, dynamics, length, forces)
+            longer = accuracy is None or _accurate(problem, dynamics, length, accuracy)
         except UEMError as error:
             dynamics.restore()
             problem.set_load(dynamics.time)
@@ -146,7 +162,7 @@ def _time_steps(problem: UnitedProblem, dynamics: Dynamics, dt: float, end: floa
         nearest = dynamics.start + np.round((dynamics.time - dynamics.start) / dt) * dt
         if abs(dynamics.time - nearest) <= rounding:
             dynamics.time = float(nearest)
-        number, cuts = control.done(iterations)
+        number, cuts = control.done(iterations, longer)
         after = touching(problem)
         yield TimeStep(number, dynamics.time, length, iterations, cuts, *events(problem, before, after))
         # the caller may have repeated the step
@@ -186,6 +202,19 @@ def _attempt(problem: UnitedProblem, length: float) -> list[Iteration]:
     problem.set_load(problem.dynamics.time + length)
     problem.dynamics.begin(length)
     return problem.attempt()
+
+
+def _accurate(problem: UnitedProblem, dynamics: Dynamics, length: float, accuracy: float) -> bool:
+    """Whether a step of twice the length would be accurate, too; refuse one that is not accurate itself (collective)."""
+    control = problem.step_control
+    error, speed = dynamics.rate_error()
+    control.largest_speed = max(control.largest_speed, speed)
+    found = error / control.largest_speed if control.largest_speed else 0.0
+    if found > accuracy:
+        raise StepAccuracyError(
+            f"the error of a step of {length:.3g} is {found:.3g} of the way at the largest speed, above the tolerance {accuracy:g}"
+        )
+    return ORDER_TWO * found <= accuracy
 
 
 def _contact_forces(problem: UnitedProblem) -> list[Array]:
