@@ -14,11 +14,15 @@ from dolfinx import fem
 from helpers import at, box, clamp, scene
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
+from uem_dolfinx.dynamics.explicit.surface import SurfaceSolver
 from uem_dolfinx.parallel import reduced
 
 COMM = MPI.COMM_WORLD
+#: Without the checks of every state, which assemble residuals.
+ATTEMPT = uem.UnitedProblem.attempt
 SHAPES = {2: "quadrilateral", 3: "hexahedron"}
 
 
@@ -35,11 +39,23 @@ class Flight:
         impedance: of the lower of two bars over that of the upper, at the same wave speed.
         nu: Poisson's ratio.
         pose: of the mesh, see ``scene``.
+        move: displacement of the wall by the time.
         how: arguments of the contact.
     """
 
     def __init__(
-        self, dim=2, cells=40, speed=10.0, gap=0.5, bars=1, law=uem.LinearElastic, impedance=1.0, nu=0.0, pose=lambda x: x, **how
+        self,
+        dim=2,
+        cells=40,
+        speed=10.0,
+        gap=0.5,
+        bars=1,
+        law=uem.LinearElastic,
+        impedance=1.0,
+        nu=0.0,
+        pose=lambda x: x,
+        move=None,
+        **how,
     ):
         across = [1.0] * (dim - 1)
         places = [gap, 10.0 + 2 * gap][:bars]
@@ -59,10 +75,11 @@ class Flight:
         self.dynamics = uem.Dynamics(uem.lumped_mass(V, density), velocity=velocity, scheme=uem.CentralDifferences())
         bottom = self.scene.tag("bottom", bars - 1, at(dim - 1, places[-1]))
         plane = uem.RigidPlane(np.zeros(dim), np.eye(dim)[-1])
+        load = None if move is None else lambda at: plane.move(move(at))
         target = plane if bars == 1 else self.scene.tag("top", 0, at(dim - 1, places[0] + 10.0))
         self.contact = uem.Contact(bottom, target, name="touch", **how)
         self.problem = uem.UnitedProblem(
-            material.residual(self.u, v) * ufl.dx, self.u, contacts=[self.contact], dynamics=self.dynamics, rtol=1e-12
+            material.residual(self.u, v) * ufl.dx, self.u, contacts=[self.contact], dynamics=self.dynamics, rtol=1e-12, load=load
         )
         self.stored = material.energy(self.u) * ufl.dx
         self.rows = []
@@ -196,6 +213,33 @@ def test_steps_that_shrink():
     assert np.ptp(lengths[:50]) == 0.0 and lengths[50] < 0.95 * lengths[0]
 
 
+def test_a_step_takes_one_residual(monkeypatch):
+    """While a linear bar stays on the wall, a step assembles one residual, and nothing is factorised."""
+    bar, made = Flight(2, 40), []
+    bar.problem.rtol = 1e-8
+    steps = uem.time_steps(bar.problem, end=0.4)
+    while next(steps).time < 0.15:
+        pass
+    monkeypatch.setattr(uem.UnitedProblem, "attempt", ATTEMPT)
+    assemble, F = forms.assemble_vector, bar.problem.bodies._F
+    monkeypatch.setattr(forms, "assemble_vector", lambda b, L: (made.append("residual") if L is F else None, assemble(b, L)))
+    for kind in (SurfaceSolver, UnitedSolver):
+        monkeypatch.setattr(kind, "_factorise" if kind is SurfaceSolver else "_set_up", lambda *a, **k: made.append("matrix"))
+    for _ in range(20):
+        assert bar.contact.n_active == 2 or COMM.size > 1
+        next(steps)
+    assert made == ["residual"] * 20
+
+
+def test_a_plane_pushes():
+    """A plane that moves upwards at a constant speed from a bar at rest on presses it with rho c v."""
+    bar = Flight(2, 40, 0.0, 0.0, move=lambda t: (0.0, 3.0 * t))
+    rows = [(step.time, bar.contact.resultant().force[1]) for step in uem.time_steps(bar.problem, end=0.6)]
+    t, force = np.array(rows).T
+    plateau = force[(t > 0.1) & (t < 0.55)]
+    assert abs(plateau.mean() / 90.0 - 1) < 5e-3
+
+
 def test_supports_and_gravity():
     """A hanging bar whose end is moved follows: its momentum is that of weight and reaction, its end has the given motion."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 10.0], [1, 20])])
@@ -241,6 +285,7 @@ REFUSED = {
     "damping": ({"dynamics": {"damping": lambda rate: ufl.inner(rate, rate) * ufl.dx}}, "damping does not go"),
     "a history": ({"history": True}, "materials does not go"),
     "a tie": ({"contact": {"tied": True}}, "is tied"),
+    "a general contact": ({"general": True}, "GeneralContact"),
     "events": ({"steps": {"event_tolerance": 0.1}}, "event_tolerance"),
     "steps taken again": ({"again": True}, "not repeated"),
 }
@@ -262,6 +307,7 @@ def test_what_does_not_go_is_refused(what):
     form = law.residual(v) if "history" in how else law.residual(u, v) * ufl.dx
     mass = (uem.consistent_mass if "consistent" in how else uem.lumped_mass)(V, 1.0)
     contact = uem.Contact(s.tag("up", 1, at(1, 10.0)), s.tag("low", 0, at(1, 10.0)), **how.get("contact", {}))
+    contact = uem.GeneralContact() if "general" in how else contact
     with pytest.raises(uem.InputError, match=words):
         problem = uem.UnitedProblem(
             form, u, contacts=[contact], materials=[law] if "history" in how else [],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
 from uem_dolfinx.errors import InputError
 
@@ -43,6 +44,10 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
         )
     for contact in contacts:
         name = f"contact '{contact.name}'"
+        if isinstance(contact, GeneralContact):
+            raise InputError(
+                f"{name}: GeneralContact, whose surfaces may keep mass, does not go with CentralDifferences: name each contact"
+            )
         if getattr(contact, "tied", False):
             raise InputError(f"{name} is tied, and its nodes have mass, which CentralDifferences move freely: {remedy}")
         if getattr(contact, "heats", ()):

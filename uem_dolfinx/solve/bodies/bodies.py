@@ -370,19 +370,22 @@ class Bodies:
             self._u.array[held] = self.wanted[held]
         self.u.x.scatter_forward()
 
-    def move(self, du: PETSc.Vec) -> bool:
-        """Add an increment to the displacement, with its residual; whether it is finite on all ranks (collective).
+    def assemble_once(self) -> bool:
+        """As ``assemble``, whose next call at the same displacement then does nothing (collective)."""
+        finite = self.assemble()
+        self._assembled_at = np.array(self.u.x.array)
+        return finite
 
-        The residual is not assembled again: that of linear bodies, just assembled, changes by ``K du``.
-        """
+    def move(self, du: PETSc.Vec) -> bool:
+        """Add an increment to the displacement, as ``assemble_once``; the residual of linear bodies changes by ``K du`` (collective)."""
+        self._assembled_at = None
         self._u.array[:] += self.config.from_rows(du.array_r)
         self.u.x.scatter_forward()
         if self.linear:
             self.tangent.update()
             self._b.array[:] += self.config.from_rows(forms.product(self.tangent.K, du).array_r)
-        finite = self.linear or self.assemble()
-        self._assembled_at = np.array(self.u.x.array)
-        return finite
+            self._assembled_at = np.array(self.u.x.array)
+        return self.linear or self.assemble_once()
 
     def inverted(self) -> str | None:
         """Position of an inverted cell, or None (collective)."""
