@@ -152,7 +152,9 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
             assert contact.n_active == 0 and highest(config.comm, np.abs(contact.force.x.array)) <= 0.0
             continue
         # a small-sliding contact has been projected anew since
-        if contact.sliding != "small":
+        if contact.normal is not None:
+            obeyed(contact)
+        elif contact.sliding != "small":
             complementary(contact, 1e-12 * config.size, 1e-7 * scale + rounding)
         if contact.pair.frictional:
             coulomb(contact.pair.whole, 1e-12 * config.size, 1e-7 * scale + rounding)
@@ -164,6 +166,16 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
     if problem.linear is not None:
         left -= problem.linear.forces(problem.linear.multipliers)
     assert highest(config.comm, np.abs(left * bodies.free[:n])) <= 1e-5 * scale + rounding
+
+
+def obeyed(contact: uem.Contact) -> None:
+    """Contactors of a soft contact press by the pressure of their gap, on one side of the surfaces alone (collective)."""
+    pair = contact.pair
+    if pair.asked:
+        p, slope = contact.normal.pressures(pair.config.comm, contact.name, pair.gaps(), 1e-9 * pair.config.size)
+        wrong = contact.pressures - np.where(pair.off | ~contact.leads(), 0.0, p)
+        # gaps are closed up to the same length as those of hard contact
+        assert highest(pair.config.comm, np.abs(wrong) - 1e-12 * (p - slope * pair.config.size)) <= 0.0
 
 
 def lever(contact: uem.Contact) -> float:

@@ -38,18 +38,18 @@ __version__ = "0.2.0"
 __all__ = [
     "Adaptation", "Balance", "CentralDifferences", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact",
     "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation",
-    "ErrorEstimate", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter", "InputError",
-    "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError",
-    "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError",
-    "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "PrecisionError", "Preload", "Resultant", "ResultsWriter",
-    "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SpaceError",
-    "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags",
-    "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce",
-    "VonMises", "adapt", "animate", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate",
-    "example_mesh", "figure", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass",
-    "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup",
-    "read_checkpoint", "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing",
-    "timings", "write_checkpoint",
+    "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact", "History",
+    "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass",
+    "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature",
+    "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "PowerLaw",
+    "PrecisionError", "Preload", "Resultant", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane",
+    "RigidSphere", "RigidSurface", "Scheme", "SoftContact", "SpaceError", "StVenantKirchhoff", "State", "Step", "StepAccuracyError",
+    "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError",
+    "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt", "animate", "axisymmetric",
+    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure", "function_space",
+    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
+    "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh",
+    "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -118,6 +118,9 @@ if _TYPE_CHECKING:
     from uem_dolfinx.conditions.equation import Equation, periodic
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.laws.conductance import Conductance
+    from uem_dolfinx.contact.laws.exponential import Exponential
+    from uem_dolfinx.contact.laws.power_law import PowerLaw
+    from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.laws.thermal import OfTemperature
     from uem_dolfinx.contact.preload import Preload
@@ -149,7 +152,8 @@ if _TYPE_CHECKING:
 
 #: Modules that are imported on first use of one of their names.
 _LATER = {
-    "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck",
+    "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "SoftContact": "contact.laws.soft",
+    "Exponential": "contact.laws.exponential", "PowerLaw": "contact.laws.power_law",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
     "CentralDifferences": "dynamics.explicit.central_differences",
     "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",

@@ -24,8 +24,10 @@ from uem_dolfinx.contact.laws.law import (
     parameters,
     values_at,
 )
+from uem_dolfinx.contact.laws.soft import SoftContact, given_normal
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.soft import interface_of
 from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics
 from uem_dolfinx.contact.warnings.checks import warn_of_slim_tips, warn_of_straight_facets
 from uem_dolfinx.contact.warnings.watch import WatchedContact
@@ -41,7 +43,6 @@ from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
-    from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.ties.tie import Tie
@@ -91,6 +92,7 @@ class Contact(WatchedContact, given.Sealed):
             initial gap or penetration of at most this length are initially in contact, free of stress. No node is moved: the
             initial gap of each contactor becomes part of its offset; :attr:`adjusted` is the largest. Tied contactors keep their
             gap, and ``adjust`` is the reach of the tie, by default True.
+        normal: None is hard contact; a ``SoftContact`` makes the pressure a function of the gap, without friction, wear, heat and tie.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -121,6 +123,7 @@ class Contact(WatchedContact, given.Sealed):
         friction: Field | FrictionLaw = 0.0,
         wear: Field = 0.0,
         heat: Conductance | Sequence[Conductance] | None = None,
+        normal: SoftContact | None = None,
         measure: str = "reference",
         name: str | None = None,
     ):
@@ -139,6 +142,7 @@ class Contact(WatchedContact, given.Sealed):
             chords = given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
             self.heats = conductances_of(heat)
+            self.normal = given_normal(normal, friction, wear, self.heats, tied)
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
             if not isinstance(adjust, (bool, np.bool_)):
@@ -299,8 +303,9 @@ class Contact(WatchedContact, given.Sealed):
         return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
 
     def words(self) -> dict[str, str]:
-        """Settings of the tie, which must be equal when a checkpoint is resumed."""
-        return {"tied and adjust": f"{self.tied}, {self.adjust}"} if self.tied or self.adjust else {}
+        """Settings of tie and normal contact, which must be equal when a checkpoint is resumed."""
+        words = {"tied and adjust": f"{self.tied}, {self.adjust}"} if self.tied or self.adjust else {}
+        return words | ({"normal": repr(self.normal)} if self.normal else {})
 
     def attach(
         self, config: Configuration, free: Bools, *, at: float = 0.0, duration: Callable[[], float] | None = None
@@ -329,7 +334,7 @@ class Contact(WatchedContact, given.Sealed):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear, heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
+            wear=self._wear, normal=repr(self.normal), heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
@@ -339,7 +344,8 @@ class Contact(WatchedContact, given.Sealed):
         discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
         tie = self._tie(nodes, discretisation, means, **of) if self.tied else None
-        self._pair, self._offsets = Interface(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
+        kind = interface_of(self.normal, self)
+        self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
         if self.tied is True:
             self._pair.project()
             self._pair.unite()

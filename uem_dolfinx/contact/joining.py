@@ -58,7 +58,8 @@ def _kind(contact: Contact) -> Hashable:
     from uem_dolfinx.geometry.search import MeshTarget
 
     pair = contact.pair
-    nodal = type(contact) is Contact and type(pair.discretisation) is NodeToSurface and type(pair.target) is MeshTarget
+    of = type(contact), type(pair), type(pair.discretisation), type(pair.target)
+    nodal = of == (Contact, Interface, NodeToSurface, MeshTarget)
     if not nodal or pair.sliding != "finite" or pair.tie is not None or pair.heats:
         return None
     if pair.friction is not None and not _joins(pair.friction):

@@ -130,7 +130,7 @@ class ContactResults:
     @property
     def n_active(self) -> int:
         """Number of active contactors over all ranks (collective)."""
-        return self.pair.n_active
+        return int(reduced(self.config.comm, int(self.pair.united.sum())))
 
     @property
     def initial_overlap(self) -> float:

@@ -33,7 +33,7 @@ def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) 
     """
     facets = config.tdim - 1
     single = [one for one in contacts if not one.of_all_surfaces and one.tied is not True and one.contactor.dim == facets]
-    conducts = np.array([any(callable(law.h) for law in one.heats) for one in single], dtype=bool)
+    conducts = np.array([one.normal is not None or any(callable(law.h) for law in one.heats) for one in single], dtype=bool)
     slides = np.array([one.pair.friction is not None for one in single], dtype=bool)
     if len(single) < 2 or not (conducts | slides).any():
         return
@@ -52,8 +52,8 @@ def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) 
         which = "surfaces" if twice[i, j] else "surfaces with the sides swapped"
         remedy = "declare one contact with all friction, wear and conductances, heat=[...]"
         raise ConflictError(
-            f"contact '{one.name}' and contact '{other.name}' have the same {which}, and share the pressure: friction, wear or h(p, g) "
-            f"of a part of it would be wrong: {remedy if twice[i, j] else 'keep one of the two'}"
+            f"contact '{one.name}' and contact '{other.name}' have the same {which}, and share the pressure: friction, wear, p(g) or "
+            f"h(p, g) of a part of it would be wrong: {remedy if twice[i, j] else 'keep one of the two'}"
         )
 
 

@@ -183,6 +183,8 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
         if any(contact.heats for contact in problem.contacts):
             raise InputError("gradients do not support heat conducted through a contact: expected contacts without heat")
+        if any(contact.normal is not None for contact in problem.contacts):
+            raise InputError("gradients do not support soft contact: expected normal = None, hard contact")
         if chords := [contact.name for contact in problem.contacts if contact.chords]:
             raise InputError(
                 f"contact '{chords[0]}': there is no gradient with chords=True, whose rows are not the derivative of the gaps: expected "

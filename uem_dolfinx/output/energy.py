@@ -33,8 +33,8 @@ class Energies:
         dissipated: by plastic flow.
         damped: by the damping form.
         external: work of the external forces, of gravity and of the reactions of Dirichlet conditions.
-        contact: work of the contact forces; zero except for friction, rounding, moving rigid targets, forces of preloads and the
-            step of first contact.
+        contact: work of the contact forces; zero except for friction, rounding, moving rigid targets, forces of preloads, the
+            step of first contact, and soft contacts, which store it.
         friction: energy dissipated by friction; with fixed targets its sum with ``contact`` is zero to rounding.
         defect: change of the sum of energies minus the work of the external and contact forces.
     """

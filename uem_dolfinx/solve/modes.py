@@ -19,7 +19,7 @@ from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError, SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, together
+from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, slip_terms, together
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.rows import make_rows
@@ -96,7 +96,10 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         P = rows.frictionless
         with timed("united matrix"):
             added = added_mass(system.linear, like)
-            A, B = _united(P, together(bodies.tangent.K, curvature)), _united(P, together(M, added))
+            # stiffness of soft contacts
+            gaps, _ = slip_terms([pair for pair in pairs if pair.trial.law_gap is not None], like)
+            stiffness = together(bodies.tangent.K, together(curvature, gaps))
+            A, B = _united(P, stiffness), _united(P, together(M, added))
     return _solve(slepc, problem, P, A, B, n)
 
 

@@ -155,8 +155,8 @@ class UnitedProblem(given.Sealed):
             self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
             self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
             given.kind("method", method, callable(method), "what makes a united system of bodies and contacts, as BodySystem")
-            if method is not BodySystem and any(contact.heats for contact in contacts):
-                raise InputError("heat passes through eliminated contacts alone: leave method out, or heat out of contacts")
+            if method is not BodySystem and any(contact.heats or contact.normal for contact in contacts):
+                raise InputError("heat and soft contact need the default method: leave method out, or heat and normal")
             consistent_tangent = given.flag("consistent_tangent", consistent_tangent)
             check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
         given.alike(

@@ -24,10 +24,12 @@ from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surfa
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
+from uem_dolfinx.contact.laws.soft import SoftContact, given_normal
 from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.neighbours import AHEAD_AT_REST
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, communicator_of
 from uem_dolfinx.parallel import agreed
@@ -63,6 +65,7 @@ class GeneralContact(OfProblem, given.Sealed):
         max_penetration: bound on the initial penetration, a length; None is 5 % of the smallest body's size.
         measure: see ``Contact``.
         name: for messages and files.
+        normal: see ``Contact``; its pressure must be 0 from a gap of half a facet on. Only nearest facets press.
         heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
 
     Raises:
@@ -84,6 +87,7 @@ class GeneralContact(OfProblem, given.Sealed):
         max_penetration: float | None = None,
         measure: str = "reference",
         name: str = "general contact",
+        normal: SoftContact | None = None,
         heat: Conductance | Sequence[Conductance] | None = None,
         tied: None = None,
     ):
@@ -107,6 +111,7 @@ class GeneralContact(OfProblem, given.Sealed):
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
             self.heats = conductances_of(heat)
+            self.normal = given_normal(normal, friction, 0.0, self.heats, False)
             given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
             if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")
@@ -153,7 +158,7 @@ class GeneralContact(OfProblem, given.Sealed):
         nodes = surface_nodes(config, surface)
         bound = MAX_PENETRATION * float(skin.extent.min()) if self.max_penetration is None else self.max_penetration
         friction = self.friction if self._pairs is None else self._pairs.law
-        options: dict[str, Any] = {"friction": friction, "max_penetration": bound, "measure": self.measure}
+        options: dict[str, Any] = {"friction": friction, "max_penetration": bound, "measure": self.measure, "normal": self.normal}
         with_facets, itself = place[skin.size > 0], np.full(skin.n_bodies, self.self_contact is True)
         for part in () if isinstance(self.self_contact, bool) else self.self_contact:
             itself |= skin.bodies_of(as_part(config, part, "self_contact"))
@@ -163,6 +168,7 @@ class GeneralContact(OfProblem, given.Sealed):
                 "itself"
             )
         self._refuse_open_conductance(config, bound)
+        self._refuse_distant_pressures(config)
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
             apart: list[Apart] = [(*where(skin, one, "exclude"), *where(skin, other, "exclude")) for one, other in pairs]
@@ -195,6 +201,16 @@ class GeneralContact(OfProblem, given.Sealed):
                 f"{self.name}: heat, h(0, g) is {open_.max():.6g} at gaps g: a general contact conducts where surfaces touch alone: "
                 "expected 0 for g > 0, or a Contact between the two surfaces that conduct through their gap"
             )
+
+    def _refuse_distant_pressures(self, config: Configuration) -> None:
+        """Raise InputError for pressures at gaps beyond the reach of the search, half a facet (collective)."""
+        if self.normal is not None:
+            far = AHEAD_AT_REST * float(self._skin.size[self._skin.size > 0].min())
+            p = self.normal.pressures(config.comm, self.name, np.array([far]), far)[0]
+            if p[0] > 0.0:
+                raise InputError(
+                    f"{self.name}: normal, p is {p[0]:.6g} at a gap of half a facet, {far:.6g}: expected 0 from there on"
+                )
 
     def _nodes(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]

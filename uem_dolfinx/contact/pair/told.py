@@ -171,10 +171,9 @@ class Told:
         """Contactors that are active or tied ``(n,)``."""
         return self.trial.active | self.tied
 
-    @property
-    def n_active(self) -> int:
-        """Number of active contactors over all ranks (collective)."""
-        return int(reduced(self.config.comm, int(self.united.sum())))
+    def displaced(self) -> float:
+        """Norm of the forces that gaps would make by a displacement of the size of positions; 0 without stiffness (collective)."""
+        return 0.0
 
     def pressing(self) -> tuple[Array, Array]:
         """Normal ``(n,)`` and tangential forces ``(n, gdim)`` that belong to ``areas`` (collective)."""

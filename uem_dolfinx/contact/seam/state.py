@@ -86,6 +86,8 @@ class PairState:
         bond: multipliers of the equations of tied contactors ``(n, gdim)``; None without ties.
         heat: power from contactors to the target by perfect conductance, one column per field ``(n, n_perfect)``; None without such
             conductances.
+        law_gap: gaps at which the law of a soft contact gives the forces, infinity for the present gaps ``(n,)``; None for hard contact,
+            and while it is switched off.
     """
 
     active: Bools
@@ -102,6 +104,7 @@ class PairState:
     friction: FrictionState | None = None
     bond: Array | None = None
     heat: Array | None = None
+    law_gap: Array | None = None
 
     @property
     def in_corner(self) -> Bools:
@@ -132,7 +135,7 @@ class PairState:
             keys_of: function from facet numbers to keys independent of the partition ``(k,)``.
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
-        for name in ("bond", "heat"):
+        for name in ("bond", "heat", "law_gap"):
             if getattr(self, name) is None:
                 del kept[name]
         if self.heat is not None and self.heat.shape[1] == 1:

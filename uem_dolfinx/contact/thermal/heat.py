@@ -23,6 +23,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.conductance import Conductance, value
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
+from uem_dolfinx.contact.seam.dyads import Terms, dyads
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.thermal.sides import Sides, sides_of
@@ -332,11 +333,11 @@ class Heat:
         """
         at, jumps = self.passage, self._jumps()
         kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
-        found = [_dyads(kappa, jumps, jumps)]
+        found = [dyads(kappa, jumps, jumps)]
         if callable(self.law.h):
             opening = at.jump[:, None] * self._pair.projection.normal[at.row]
             slopes = np.where(self._pair.united, 0.0, self._slopes())
-            found.append(_dyads(slopes, jumps, Terms(at.row, at.node, opening)))
+            found.append(dyads(slopes, jumps, Terms(at.row, at.node, opening)))
         return found
 
     def by_forces(self, equations: ContactRows, lift: Array) -> tuple[Ints, Array]:
@@ -352,7 +353,7 @@ class Heat:
         slopes = np.where(pair.trial.active & (config.degree == 1), self._slopes(), 0.0)
         weights, own = slopes * self._per_area() * self.passage.force, equations.normal
         which = equations.contactor[own]
-        return _dyads(weights, self._jumps(), Terms(which, config.to_global(pair.nodes[which]), lift[own]))
+        return dyads(weights, self._jumps(), Terms(which, config.to_global(pair.nodes[which]), lift[own]))
 
     def _jumps(self) -> Terms:
         """Temperature jumps of contactors as linear functions of the unknowns (collective)."""
@@ -377,34 +378,3 @@ def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared) -> list
     if columns[-1]:
         pair.trial = pair.committed = replace(pair.committed, heat=np.zeros((len(pair.nodes), columns[-1])))
     return [Heat(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
-
-
-class Terms(NamedTuple):
-    """Terms of linear functions of the unknowns, one function per contactor.
-
-    Attributes:
-        row: index of the contactor ``(k,)``.
-        node: global row of vectors ``(k,)``.
-        vector: coefficients of the components there ``(k, gdim)``.
-    """
-
-    row: Ints
-    node: Ints
-    vector: Array
-
-
-def _dyads(scale: Array, left: Terms, right: Terms) -> tuple[Ints, Array]:
-    """``sum_i scale_i v_i w_i'`` of linear functions v and w of contactors, in blocks as in ``Heat.tangent``."""
-    row, node = (np.concatenate(both) for both in zip(left[:2], right[:2]))
-    some = np.flatnonzero(scale[row] != 0.0)
-    # group the terms of each contactor
-    order = some[np.argsort(row[some], kind="stable")]
-    which, first, i = np.unique(row[order], return_index=True, return_inverse=True)
-    place = np.arange(len(order)) - first[i]
-    rows = np.full((len(which), int(place.max(initial=-1)) + 1), -1, dtype=np.int64)
-    rows[i, place] = node[order]
-    of_left, g = order < len(left.row), left.vector.shape[1]
-    vectors, both = np.concatenate([left.vector, right.vector])[order], np.zeros((2, *rows.shape, g))
-    both[0, i, place], both[1, i, place] = vectors * of_left[:, None], vectors * ~of_left[:, None]
-    v, w = both.reshape(2, len(which), rows.shape[1] * g)
-    return rows, scale[which, None, None] * v[:, :, None] * w[:, None, :]

@@ -175,7 +175,7 @@ class Bodies:
         if not more:
             return norm
         size = float(np.linalg.norm(more))
-        return np.hypot(norm, size if self._fields is None else self._first(size))
+        return np.hypot(norm, size if self._fields is None else self.of_fields(size))
 
     @property
     def linear(self) -> bool:
@@ -222,7 +222,9 @@ class Bodies:
         if self._added:
             of_points = FORCE_ROUNDING * np.linalg.norm([one.rounding() for one in self._added])
             of_displacement = float(np.hypot(of_displacement, of_points))
-        return of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self._first(of_displacement)
+        return (
+            of_displacement if self._fields is None else FORCE_ROUNDING * self._fields.largest() + self.of_fields(of_displacement)
+        )
 
     def rounding_of_displacement(self) -> float:
         """Norm of the displacement's forces due to rounding of the displacement and of its gradient (collective)."""
@@ -256,7 +258,7 @@ class Bodies:
         told = float(self.config.vector(np.where(np.abs(F) > limit, F, 0.0)).norm())
         if self._fields is None:
             return self._beside(told, [one.size() for one in self._added])
-        return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self._first(told)
+        return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self.of_fields(told)
 
     def remembered(self, positioned: bool) -> Any:
         """Norm relative to which forces of later steps may be rounding, with the terms of other fields (collective)."""
@@ -271,11 +273,11 @@ class Bodies:
         if self.stiffness is None or not self.config.moves:
             return 0.0
         size = float(np.finfo(float).eps * self.config.vector(self.stiffness).norm() * self.config.size)
-        return size if self._fields is None else self._fields.strain_rounding(self.config.size) + self._first(size)
+        return size if self._fields is None else self._fields.strain_rounding(self.config.size) + self.of_fields(size)
 
-    def _first(self, of_displacement: float) -> Array:
-        """A norm of the displacement's forces, with zeros for the other fields ``(n_fields,)``."""
-        return np.append(of_displacement, np.zeros(self.unknowns.n_fields - 1))
+    def of_fields(self, of_displacement: float) -> Any:
+        """A norm of the displacement's forces; with other fields, one for each field, zeros for the others ``(n_fields,)``."""
+        return of_displacement if self._fields is None else np.append(of_displacement, np.zeros(self.unknowns.n_fields - 1))
 
     # -- Dirichlet conditions ------------------------------------------------------------------------------------------
 

@@ -104,6 +104,7 @@ class BodySystem:
         """Collect the pairs that may be in contact on any rank; iterations loop over these only."""
         self.near: list[Interface] = in_question(self.pairs)
         self._heats: list[Heat] = [heat for pair in self.near for heat in pair.heats]
+        self._soft = any(pair.trial.law_gap is not None for pair in self.near)
 
     # -- projection of contactors ----------------------------------------------------------------------------------------
 
@@ -176,8 +177,7 @@ class BodySystem:
         F = self.bodies.residual
         for nodes, forces in filter(None, (*known_forces(self.near), *(pair.applied_forces() for pair in self.near))):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
-        for heat in self._heats:
-            F.array[:] += heat.residual()
+        F.array[:] += sum(heat.residual() for heat in self._heats)
         return F
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
@@ -196,8 +196,7 @@ class BodySystem:
         F, rounding = self.residual(), self.rounding()
         with timed("uniting equations"):
             rows, self._here = self._rows_here(), None
-            y = rows.test.pass_on(F)
-            residual = rows.test.reduce(y)
+            residual = rows.test.reduce(y := rows.test.pass_on(F))
             at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             if at_rest or (turning and not pairs):
                 self._take(self._read_forces(rows, y))
@@ -360,9 +359,10 @@ class BodySystem:
 
     def rounding(self) -> float:
         """Norm of the forces due to rounding of the displacement, and of the active contactors' positions (collective)."""
-        active = [pair.nodes[pair.united] for pair in self.near]
-        of_bodies = self.bodies.rounding(np.concatenate([np.zeros(0, np.int32), *active]))
-        return of_bodies + FORCE_ROUNDING * sum(self.unknowns.norms_of(heat.sizes()) for heat in self._heats)
+        active = [np.zeros(0, np.int32), *(pair.nodes[pair.united] for pair in self.near)]
+        of_bodies = self.bodies.rounding(np.concatenate(active))
+        of_heat = sum(self.unknowns.norms_of(heat.sizes()) for heat in self._heats)
+        return of_bodies + FORCE_ROUNDING * (of_heat + self.bodies.of_fields(sum(pair.displaced() for pair in self.near)))
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` of the last projection and the last assembled residual, with the active set of ``state``.
@@ -409,14 +409,14 @@ class BodySystem:
         refuse_bare(self.bodies, P, Q, curvature)
         # modified Newton ignores changes of coefficients in P
         self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
-        linear, iterative = self.bodies.linear and not (self.linear is not None and self.linear.turning), self.solver.inexact
+        linear = self.bodies.linear and not (self._soft or (self.linear is not None and self.linear.turning))
         # in dynamics momentum is conserved exactly by exact solves
         passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
         return LinearisedProblem(
             state=state,
             rhs=-Q.transpose(self._predicted_forces(state, c, forms.product(K, c))),
-            exact=not iterative and (self.bodies.dynamics is not None or not passing),
-            iterative=iterative,
+            exact=not self.solver.inexact and (self.bodies.dynamics is not None or not passing),
+            iterative=self.solver.inexact,
             passing=passing,
             fits=linear,
             convex=self.exchanges.convex,

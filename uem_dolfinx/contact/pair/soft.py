@@ -1,0 +1,253 @@
+"""The interface of a soft contact: contactors are never united, their gaps have a force and a stiffness.
+
+The gap g_i of a contactor has the gradient r_i, the row that hard contact unites with. Its force is ``lam_i = A_i p(g_i)`` with the area
+A_i of the pressure, so that the residual is ``F - sum_i r_i lam_i``, and its derivative has the terms ``-sum_i A_i p'(g_i) r_i r_i'`` and,
+as for hard contact, the curvature ``-sum_i lam_i grad^2 g_i``. Changes of areas are left out of the derivative.
+
+Within a step the forces are those that the linearised problem predicts, as the multipliers of hard contact are, and the law holds at the
+gaps g_i* under them: the problem also closes what is left between g_i and g_i*. Any stiffness is then as good as hard contact, where
+forces by the gaps of every iterate would be too large. Rows contain both bodies: action equals reaction. For bodies that only
+contact holds, gaps with a stiffness are held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.laws.soft import SoftContact
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.active_set import TOUCHING, Violations
+from uem_dolfinx.contact.seam.dyads import Terms, grouped
+from uem_dolfinx.contact.seam.ends import slide_off
+from uem_dolfinx.contact.seam.placement import ContactRows, Traction
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import reduced
+
+#: A gap holds a body that nothing else holds where it has more than this part of its stiffness at rest.
+#: [convention; slope of the law; test_soft_contact.py::test_what_holds_a_body]
+HELD_FROM = 1e-6
+#: Gaps under a pressure are found by so many bisections, and one step of Newton's method.
+#: [bound; bisections; -]
+BISECTIONS = 30
+
+
+def interface_of(law: SoftContact | None, contact: Any) -> Callable[..., Interface]:
+    """Class of a contact's interface, which is hard without a law; InputError for a law of points, which have no areas."""
+    if law is None:
+        return Interface
+    if contact.contactor.dim == 0:
+        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
+    return partial(SoftInterface, law=law, contact=contact)
+
+
+class SoftInterface(Interface):
+    """Contactors with a pressure by their gaps; other arguments as for ``Interface``.
+
+    Args:
+        law: pressure by the gap.
+        contact: that it belongs to, for ``measured_areas`` and ``leads``, see ``ContactResults``.
+    """
+
+    #: Its forces store and release energy.
+    works = True
+
+    def __init__(self, *args: Any, law: SoftContact, contact: Any, **how: Any):
+        super().__init__(*args, **how)
+        self._law, self._contact = law, contact
+        # a corner of the target presses by its nearest facet alone
+        self.discretisation.concave_edges = None  # type: ignore[attr-defined]
+        n = len(self.nodes)
+        self.trial = self.committed = replace(self.committed, law_gap=np.full(n, np.inf))
+        #: Gaps at which the law gives the forces, multipliers and stiffnesses of the rows there, areas, and contactors whose gap is held
+        #: ``(n,)``.
+        self._at = self._multipliers = self._stiffness = self._area = np.zeros(n)
+        self._holds: Bools = np.zeros(n, dtype=bool)
+        #: Whether the law has a slope at rest, which stops bodies that fall.
+        self._stops = True
+        #: Gaps and multipliers that the last linearised problem predicts ``(n,)``, or None.
+        self._predicted: tuple[Array, Array] | None = None
+
+    @property
+    def _acts(self) -> bool:
+        """Whether any contactor may press."""
+        return self.asked and self.trial.law_gap is not None
+
+    # -- placement and forces --------------------------------------------------------------------------------------------
+
+    def _project(self) -> None:
+        super()._project()
+        n, known = len(self.nodes), self.trial.law_gap
+        if not self._acts or known is None:
+            self._multipliers, self._stiffness, self._holds = *np.zeros((2, n)), np.zeros(n, dtype=bool)
+            return
+        rest, gap = self._law.law.rest, self.gaps()
+        at = np.where(np.isinf(known), gap, known)
+        # where the law has no slope contactors are open; those that just touch have the stiffness of those that press
+        opened = np.where(gap <= rest + TOUCHING * self.config.size, rest, gap)
+        self._at = np.where(self._pressures(at)[1] < 0.0, at, opened)
+        p, slope = self._pressures(np.append(self._at, rest))
+        self._area = np.where(self.off | ~self._contact.leads(), 0.0, self._contact.measured_areas())
+        self._multipliers, self._stiffness = self._area * p[:n] / self._force, -self._area * slope[:n] / self._force**2
+        self._holds = (self._area > 0.0) & (slope[:n] < 0.0) & (slope[:n] <= HELD_FROM * slope[-1])
+        self._stops = bool(slope[-1] < 0.0)
+        super().set_forces(self._traction(self._multipliers))
+
+    def _pressures(self, gap: Array) -> tuple[Array, Array]:
+        """Pressures and their derivatives at gaps ``(n,)`` (collective)."""
+        return self._law.pressures(self.config.comm, self.name, gap, TOUCHING * self.config.size)
+
+    @property
+    def _force(self) -> Array:
+        """Forces over multipliers, or gaps of rows over the gaps that the law sees ``(n,)`` (collective)."""
+        return self.kinematics.pressure_map(False).force
+
+    def gaps(self) -> Array:
+        """Gaps of the law ``(n,)``: of nodes, in Bernstein's basis at degree 2, or means with the dual functions (collective)."""
+        return np.asarray(self.kinematics.gap_rows.equations.gap[: len(self.nodes)] / self._force)
+
+    def _traction(self, multipliers: Array) -> Traction:
+        """Contact forces of multipliers ``(n,)`` (collective)."""
+        every = np.ones(len(self.nodes), dtype=bool)
+        rows = self.kinematics.gap_rows.select(np.arange(len(every)), every)
+        return self.kinematics.forces(replace(self.trial, active=every), rows, multipliers[rows.contactor])
+
+    def forces(self, equations: ContactRows, multipliers: Array, du: Array | None = None) -> Traction:
+        """Contact forces, present or predicted by the linearised law; see ``Interface`` (collective)."""
+        if du is None or not self._acts:
+            return self.traction
+        rows, force = self.kinematics.gap_rows, self._force
+        ahead = rows.equations.gap[: len(force)] + rows.along(du)
+        predicted = self._multipliers - self._stiffness * (ahead - force * self._at)
+        self._predicted = ahead / force, predicted
+        return self._traction(np.maximum(predicted, 0.0))
+
+    def set_forces(self, found: Traction, active: Bools | None = None) -> None:
+        """Set contact forces of the trial state; predicted ones hold from the next placement on (collective)."""
+        super().set_forces(found, active)
+        if self._predicted is None:
+            return
+        (gap, multipliers), self._predicted = self._predicted, None
+        pressing, area = (self._stiffness > 0.0) & (multipliers > 0.0), np.where(self._area > 0.0, self._area, 1.0)
+        p = np.where(pressing, multipliers * self._force / area, 0.0)
+        # where the law is linearised from without a slope it begins at rest: forces grow with the solutions, not with the gaps
+        there = np.where(pressing, self._gaps_under(p, gap), np.maximum(gap, self._law.law.rest))
+        self.trial = replace(self.trial, law_gap=there)
+
+    def _gaps_under(self, p: Array, gap: Array) -> Array:
+        """Gaps under pressures ``(n,)``, from the present ones in the direction of predicted gaps (collective)."""
+
+        def more(g: Array) -> Bools:
+            return self._pressures(g)[0] > p
+
+        begin, end = self._at, gap
+        up, way = end > begin, end - begin
+        for k in range(BISECTIONS):
+            # for a convex law unloading ends beyond
+            beyond = up & more(end)
+            if not reduced(self.config.comm, bool(beyond.any()), op=MPI.LOR):
+                break
+            begin, end = np.where(beyond, end, begin), np.where(beyond, end + 2.0**k * way, end)
+        low, high = np.minimum(begin, end), np.maximum(begin, end)
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = np.where(more(middle), middle, low), np.where(more(middle), high, middle)
+        # Newton's rule for what bisection leaves
+        there, slope = self._pressures(middle)
+        return np.asarray(np.where(slope < 0.0, middle - (there - p) / np.where(slope < 0.0, slope, 1.0), middle))
+
+    def applied_forces(self) -> tuple[Ints, Array] | None:
+        """The contact forces by the rows, as loads of both bodies."""
+        return self.kinematics.gap_rows.forces(self._multipliers) if self._acts else None
+
+    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+        """Stiffness of the gaps, and their forces by what is left between the gaps and those of the law; see ``Interface``."""
+        if not self._acts:
+            return None
+        eq = self.kinematics.gap_rows.equations
+        row, node = np.append(np.arange(len(eq)), eq.row), np.append(self.config.to_global(eq.node), eq.followed)
+        gradient = Terms(row, node, np.concatenate([eq.direction, -eq.coefficients]))
+        nodes, which, v, _ = grouped(self._stiffness, gradient, gradient)
+        k, left = self._stiffness[which], (self._force * (self.gaps() - self._at))[which]
+        return nodes, k[:, None, None] * v[:, :, None] * v[:, None, :], (k * left)[:, None] * v
+
+    def largest_gap_here(self) -> float:
+        """Largest difference of a gap from that of its force, a length."""
+        return float(np.abs(self.gaps() - self._at)[self._stiffness > 0.0].max(initial=0.0)) if self._acts else 0.0
+
+    def displaced(self) -> float:
+        """See ``Told``."""
+        size = np.linalg.norm(self.points, axis=1, ord=np.inf) if len(self.nodes) else np.zeros(0)
+        return float(np.sqrt(2.0 * reduced(self.config.comm, float(((self._stiffness * size) ** 2).sum()))))
+
+    # -- no contactor is active ------------------------------------------------------------------------------------------
+
+    @property
+    def united(self) -> Bools:
+        """Contactors under pressure ``(n,)``."""
+        return self.trial.lam > 0.0
+
+    @property
+    def movable(self) -> Bools:
+        """All of them: prescribed contactors press as others do ``(n,)``."""
+        return np.ones(len(self.nodes), dtype=bool)
+
+    def violated(self, gap: Array, *conditions: Any, **how: Any) -> Violations:
+        """None."""
+        return Violations.none(len(self.nodes))
+
+    def activate_touching(self) -> None:
+        """None, but ends hold contactors that touch there, and pressures begin to act (collective)."""
+        self.trial = self.committed = replace(
+            self.trial, at_end=self._at_end(self.trial), law_gap=np.full(len(self.nodes), np.inf)
+        )
+        self.project()
+
+    def follow(self) -> bool:
+        """Release contactors past an end (collective); see ``Interface``."""
+        pressing = replace(self.trial, active=self.united)
+        gone = bool((pressing.active & self.off).any())
+        self.kinematics, state, _ = self.kinematics.follow(slide_off(pressing, self.off))
+        self.trial = replace(state, active=self.trial.active)
+        return gone
+
+    # -- bodies that only contact holds ----------------------------------------------------------------------------------
+
+    def equations(self) -> ContactRows:
+        """Rows of gaps that hold bodies, of which none is eliminated (collective)."""
+        which = np.flatnonzero(self._holds)
+        rows = self.kinematics.gap_rows.select(which, np.zeros(len(self.nodes), dtype=bool))
+        held = np.ones(len(rows), dtype=bool)
+        return replace(rows, kind=np.full(len(rows), -1), moved=None, resisted=held, crosswise=replace(rows.rows, active=held))
+
+    @property
+    def approach(self) -> UnitingEquations:
+        """Rows of contactors that hold no body yet, with gaps above the gap at rest."""
+        rows = self.kinematics.gap_rows
+        ahead = rows.select(np.flatnonzero(~self._holds & ~self.off & self._stops), np.ones(len(self.nodes), dtype=bool))
+        equations = ahead.rows.select(ahead.normal)
+        return replace(equations, gap=equations.gap - (self._law.law.rest * self._force)[ahead.contactor[ahead.normal]])
+
+    def activate_closing(self, closing: Bools) -> bool:
+        """Gaps hold by themselves."""
+        return False
+
+    def commit(self) -> None:
+        """See ``Interface``; contactors that press have not passed an end, those that hold nothing follow their gaps."""
+        known = self.trial.law_gap
+        kept = None if known is None else np.where(self._holds, self._at, np.inf)
+        self.trial = replace(self.trial, passed=self.trial.passed & ~self.united, law_gap=kept)
+        super().commit()
+
+    def restore(self) -> None:
+        """See ``Interface``."""
+        super().restore()
+        self._predicted = None
