@@ -240,6 +240,16 @@ def test_a_plane_pushes():
     assert abs(plateau.mean() / 90.0 - 1) < 5e-3
 
 
+def test_a_step_that_fails():
+    """A wave that turns cells inside out ends the run with their place, in the last converged state."""
+    bar = Flight(2, 40, 25.0, 0.1, law=uem.NeoHooke)
+    with pytest.raises((uem.InvertedElementError, uem.NotFiniteError)):
+        for _ in uem.time_steps(bar.problem, end=1.0):
+            pass
+    assert np.array_equal(bar.u.x.array, bar.problem.committed) and not bar.dynamics.moving
+    assert 0.0 < bar.dynamics.time < 1.0
+
+
 def test_supports_and_gravity():
     """A hanging bar whose end is moved follows: its momentum is that of weight and reaction, its end has the given motion."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 10.0], [1, 20])])

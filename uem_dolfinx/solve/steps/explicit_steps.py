@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
-from uem_dolfinx.errors import InputError
+from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import gathered
 from uem_dolfinx.solve.steps.time_step import TimeStep, events, touching
@@ -41,8 +41,14 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), _pattern(problem)
     while (remainder := end - dynamics.time) > LEFT * length:
         taken = length if remainder >= (1.0 - LEFT) * length else remainder
-        problem.set_load(dynamics.time + taken)
-        iterations = stepper.step(taken)
+        try:
+            problem.set_load(dynamics.time + taken)
+            iterations = stepper.step(taken)
+        except UEMError:
+            dynamics.restore()
+            problem.set_load(dynamics.time)
+            problem.restore()
+            raise
         control.begin(length)
         number, cuts = control.done(iterations)
         after = touching(problem)
