@@ -11,8 +11,11 @@ import numpy as np
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
 
-#: Gmsh's types of list-based views with scalars at the vertices of a cell.
-VIEWS = {"triangle": "ST", "quadrilateral": "SQ", "tetrahedron": "SS", "hexahedron": "SH"}
+#: Simplices that fill a cell, by its vertices in DOLFINx's order.
+SIMPLICES = {
+    "triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]], "tetrahedron": [[0, 1, 2, 3]],
+    "hexahedron": [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]],
+}  # fmt: skip
 #: Sizes grow by at most this part of the way from one cell to the next, so that cells have good shapes.
 #: [convention; size over distance; test_mesh_sizes.py::test_sizes_grow_slowly]
 GROWTH = 0.5
@@ -55,11 +58,13 @@ class MeshSizes:
         """Mesh with these sizes, on rank 0."""
         before = {name: gmsh.option.getNumber(name) for name in OTHERS}
         view = gmsh.view.add("sizes")
-        m, n_vertices, gdim = self.points.shape
-        x = np.zeros((m, 3, n_vertices))
-        x[:, :gdim] = self.points.transpose(0, 2, 1)
-        data = np.concatenate([x.reshape(m, -1), self.values], axis=1)
-        gmsh.view.addListData(view, VIEWS[self.cell], m, data.ravel().tolist())
+        corners = np.array(SIMPLICES[self.cell])
+        gdim, k = self.points.shape[2], corners.shape[1]
+        points, values = self.points[:, corners].reshape(-1, k, gdim), self.values[:, corners].reshape(-1, k)
+        x = np.zeros((len(points), 3, k))
+        x[:, :gdim] = points.transpose(0, 2, 1)
+        data = np.concatenate([x.reshape(len(x), -1), values], axis=1)
+        gmsh.view.addListData(view, "ST" if k == 3 else "SS", len(x), data.ravel().tolist())
         field = gmsh.model.mesh.field.add("PostView")
         gmsh.model.mesh.field.setNumber(field, "ViewTag", view)
         gmsh.model.mesh.field.setAsBackgroundMesh(field)
