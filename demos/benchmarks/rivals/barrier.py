@@ -26,6 +26,7 @@ from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import tributary_areas
+from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
@@ -207,7 +208,7 @@ class BarrierSystem(PushedSystem):
             scale=self.bodies.residual.norm(),
             rounding=self.rounding(),
             gap=0.0,
-            active=sum(pair.n_active for pair in self.pairs),
+            active=reduced(self.config.comm, sum(int(pair.united.sum()) for pair in self.pairs)),
             changed=False,
             right=True,
             closed=self.bodies.dirichlet_met(),

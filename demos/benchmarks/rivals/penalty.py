@@ -27,6 +27,7 @@ from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import tributary_areas
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING
 from uem_dolfinx.solve.bodies.tangent import contact_curvature
+from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
@@ -278,7 +279,7 @@ class PenaltySystem(PushedSystem):
             scale=F.norm(),
             rounding=rounding,
             gap=overlap,
-            active=sum(pair.n_active for pair in self.pairs),
+            active=reduced(self.config.comm, sum(int(pair.united.sum()) for pair in self.pairs)),
             changed=changed,
             right=True,
             closed=self.bodies.dirichlet_met() and not deep,
