@@ -34,6 +34,7 @@ from helpers import complementary, coulomb, highest
 
 import uem_dolfinx as uem
 from uem_dolfinx.contact.mortar.placement import Contactors
+from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES
 from uem_dolfinx.solve.bodies.norms import first
 from uem_dolfinx.solve.united.system import BodySystem
 
@@ -191,6 +192,9 @@ def lever(contact: uem.Contact) -> float:
     sideways = pair.frictional or pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
     if pair.projection.offset is not None and sideways:
         return np.inf
+    # across a gap the averaged normals of a soft contact lean by the angle of the facets
+    if contact.normal is not None and highest(pair.config.comm, pair.trial.changes) >= MOST_CHANGES:
+        return 1e-6
     return 1e-7 if contact.pair.frictional and not contact.pair.discretisation.at_feet else 1e-11
 
 

@@ -241,6 +241,27 @@ def test_a_run_that_goes_on(folder):
     assert rest == pytest.approx(whole[2:], rel=1e-9)
 
 
+@pytest.mark.parametrize("general", [False, slow(True)])
+def test_contactors_over_edges_of_tetrahedra(general):
+    """Contactors that alternate between two facets of a bending surface get averaged normals, and a step ends."""
+    b = blocks(COMM, "tetrahedron", 2, 3, overhang=0.3)
+    normal = uem.SoftContact(uem.Exponential(2e-3, 1e-3))
+    contact = uem.GeneralContact(normal=normal) if general else uem.Contact(b.high, b.low, normal=normal)
+    bcs = [uem.dirichlet(b.V, b.bottom), uem.dirichlet(b.V, b.top, value=(0.0, 0.0, -0.03))]
+    (step,) = run(uem.UnitedProblem(st_venant(b.u, 1.0), b.u, bcs=bcs, contacts=[contact], petsc_options_prefix="soft_"))
+    assert step.newton_iterations < 20 and step.cuts == 0
+
+
+def test_switched_off_and_on():
+    """A soft contact that is switched off presses no more, and presses as before when it is on again."""
+    b = blocks(COMM, "quadrilateral", 2, 4)
+    contact = uem.Contact(b.high, b.low, normal=uem.SoftContact(ROUGH))
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.02), contacts=[contact], petsc_options_prefix="soft_")
+    steps = [uem.Step(), uem.Step(contacts={contact: False}), uem.Step(contacts={contact: True})]
+    forces = [contact.resultant().force[1] for _ in uem.load_steps(problem, steps)]
+    assert forces[0] > 0.01 and forces[1] == 0.0 and forces[2] == pytest.approx(forces[0], rel=1e-8)
+
+
 def test_what_is_refused():
     """What does not go with a soft contact is named; so are laws that are none."""
     b = blocks(COMM, "quadrilateral", 2, 3)

@@ -24,11 +24,13 @@ import numpy as np
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.laws.soft import SoftContact
+from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, with_averaged_normals
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Violations
 from uem_dolfinx.contact.seam.dyads import Terms, grouped
 from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.placement import ContactRows, Traction
+from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
 
@@ -49,6 +51,29 @@ def interface_of(law: SoftContact | None, contact: Any) -> Callable[..., Interfa
     return partial(SoftInterface, law=law, contact=contact)
 
 
+class _Edges:
+    """In place of ``ConcaveEdges``: facets press alone, also in corners; contactors that alternate between them get averaged normals."""
+
+    free = offset = mu = None
+
+    def place(self, nearest: Any, points: Array, state: PairState) -> tuple[Any, None]:
+        """Projection of all contactors, and no corners."""
+        return with_averaged_normals(nearest, state.changes >= MOST_CHANGES, points), None
+
+    def place_again(self, nearest: Any, left: Bools, points: Array, state: PairState) -> tuple[Any, Any, None]:
+        """The same in another state."""
+        return nearest, *self.place(nearest, points, state)
+
+    def leave(self, corners: None, state: PairState) -> tuple[PairState, Bools]:
+        """None leaves a corner."""
+        return state, np.zeros(len(state.active), dtype=bool)
+
+    def follow(self, nearest: Any, left: Bools, points: Array, state: PairState) -> tuple[PairState, bool]:
+        """Count changes of facet."""
+        moved = state.active & (state.facet >= 0) & (state.facet != nearest.facet)
+        return replace(state, facet=nearest.facet, changes=state.changes + moved), False
+
+
 class SoftInterface(Interface):
     """Contactors with a pressure by their gaps; other arguments as for ``Interface``.
 
@@ -63,8 +88,8 @@ class SoftInterface(Interface):
     def __init__(self, *args: Any, law: SoftContact, contact: Any, **how: Any):
         super().__init__(*args, **how)
         self._law, self._contact = law, contact
-        # a corner of the target presses by its nearest facet alone
-        self.discretisation.concave_edges = None  # type: ignore[attr-defined]
+        if getattr(self.discretisation, "concave_edges", None) is not None:
+            self.discretisation.concave_edges = _Edges()  # type: ignore[attr-defined]
         n = len(self.nodes)
         self.trial = self.committed = replace(self.committed, law_gap=np.full(n, np.inf))
         #: Gaps at which the law gives the forces, multipliers and stiffnesses of the rows there, areas, and contactors whose gap is held
