@@ -12,10 +12,11 @@ import pytest
 import ufl
 from body_scenes import fork
 from dolfinx import fem
-from helpers import M, at, blocks, box, clamp, highest, linear, refused, run, scene, slow, st_venant
+from helpers import M, arch, at, blocks, box, clamp, highest, linear, refused, run, scene, slow, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.solve.bodies.tangent import contact_curvature, curvature_of
 
 COMM = MPI.COMM_WORLD
 ROUGH = uem.Exponential(2e-3, 1e-3)
@@ -295,3 +296,38 @@ def test_what_is_refused():
     explicit = uem.Dynamics(uem.lumped_mass(b.V, 1.0), scheme=uem.CentralDifferences())
     soft_one = uem.Contact(b.high, b.low, normal=soft)
     refused(uem.InputError, "CentralDifferences", lambda: problem(soft_one, dynamics=explicit))
+
+
+@pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron")])
+def test_the_tangent_is_the_derivative(cell):
+    """On arched surfaces ``K + sum k r r' - sum lambda grad^2 g`` is the derivative of the forces by their present gaps."""
+    b = blocks(COMM, cell, 3, 4, pose=arch(0.2), gap=-0.02)
+    contact = uem.Contact(b.high, b.low, normal=uem.SoftContact(ROUGH))
+    problem = uem.UnitedProblem(st_venant(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
+    system, pair, config = problem.system, contact.pair, problem.config
+    x = config.X
+    smooth = 0.005 * np.stack([np.sin(2 * x[:, i] + i) for i in range(b.gdim)], axis=1)
+    direction = np.stack([np.cos(3 * x[:, i] + 2 * i) for i in range(b.gdim)], axis=1)
+
+    def residual(u):
+        problem.u.x.array[:] = u.ravel()
+        system.place()
+        problem.bodies.assemble()
+        return system.residual()
+
+    assert highest(COMM, np.abs(residual(smooth).array_r)) > 0 and COMM.allreduce(int((pair.trial.lam > 0).sum())) > 2
+    facets = pair.projection.facet.copy()
+    K = problem.bodies.update_tangent().copy()
+    nodes, blocks_of_gaps, left = pair.slip_terms()
+    assert highest(COMM, np.abs(left)) < 1e-12
+    of_gaps = contact_curvature([(nodes, blocks_of_gaps)], config.vector())
+    bends = curvature_of([pair], config.vector(), True, False)
+    du = K.createVecRight()
+    du.array[:] = direction[: config.n_owned].ravel()
+    wanted = K * du + of_gaps * du + bends * du
+    h = 1e-6
+    found = residual(smooth + h * direction) - residual(smooth - h * direction)
+    assert highest(COMM, np.abs(pair.projection.facet - facets)) == 0
+    found.scale(0.5 / h)
+    assert (found - wanted).norm() < 1e-6 * wanted.norm()
+    assert (bends * du).norm() > 1e-4 * wanted.norm() and (of_gaps * du).norm() > 1e-2 * wanted.norm()
