@@ -24,10 +24,8 @@ from uem_dolfinx.contact.laws.law import (
     parameters,
     values_at,
 )
-from uem_dolfinx.contact.laws.soft import SoftContact, given_normal
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.contact.pair.soft import interface_of
 from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics
 from uem_dolfinx.contact.warnings.checks import warn_of_slim_tips, warn_of_straight_facets
 from uem_dolfinx.contact.warnings.watch import WatchedContact
@@ -43,6 +41,7 @@ from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.ties.tie import Tie
@@ -142,7 +141,11 @@ class Contact(WatchedContact, given.Sealed):
             chords = given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
             self.heats = conductances_of(heat)
-            self.normal = given_normal(normal, friction, wear, self.heats, tied)
+            self.normal = normal
+            if normal is not None:
+                from uem_dolfinx.contact.laws.soft import given_normal
+
+                self.normal = given_normal(normal, friction, wear, self.heats, tied)
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
             if not isinstance(adjust, (bool, np.bool_)):
@@ -344,7 +347,11 @@ class Contact(WatchedContact, given.Sealed):
         discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
         tie = self._tie(nodes, discretisation, means, **of) if self.tied else None
-        kind = interface_of(self.normal, self)
+        kind: Callable[..., Interface] = Interface
+        if self.normal is not None:
+            from uem_dolfinx.contact.pair.soft import interface_of
+
+            kind = interface_of(self.normal, self)
         self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
         if self.tied is True:
             self._pair.project()
@@ -356,15 +363,8 @@ class Contact(WatchedContact, given.Sealed):
             from uem_dolfinx.contact.friction.wear import Wear
 
             assert friction is not None
-            friction.wear = Wear(
-                config,
-                nodes,
-                self._wear,
-                tag=self.contactor,
-                areas=self.surface,
-                lower=self._offsets_of_pair().wear,
-                name=self.name,
-            )
+            how = {"tag": self.contactor, "areas": self.surface, "lower": self._offsets_of_pair().wear, "name": self.name}
+            friction.wear = Wear(config, nodes, self._wear, **how)
         if self.heats:
             from uem_dolfinx.contact.thermal.heat import heats_of
 

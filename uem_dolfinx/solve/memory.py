@@ -10,7 +10,6 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError, UEMError, UserFunctionError
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.parallel import agreed
@@ -122,8 +121,11 @@ def take_again(problem: Any, before: Memory, led: tuple[Array | None, float, boo
         UEMError: as in ``UnitedProblem.attempt``, after the previous result has been restored.
     """
     start, fraction, arc = led
-    if is_explicit(problem.dynamics):
-        raise InputError("explicit steps are not repeated: leave solve() out of the loop over time_steps")
+    if problem.dynamics is not None:
+        from uem_dolfinx.dynamics.explicit.refused import is_explicit
+
+        if is_explicit(problem.dynamics):
+            raise InputError("explicit steps are not repeated: leave solve() out of the loop over time_steps")
     dynamics, now, moved, found = problem.dynamics, Memory.of(problem), problem.rigid_motions(), np.array(problem.u.x.array)
     before.put_back(problem)
     move_targets(problem, moved)

@@ -24,19 +24,18 @@ from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surfa
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
-from uem_dolfinx.contact.laws.soft import SoftContact, given_normal
 from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
-from uem_dolfinx.geometry.neighbours import AHEAD_AT_REST
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, communicator_of
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.general.pair_friction import FrictionOfPairs
+    from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.geometry.skin import Apart
 
 
@@ -111,7 +110,11 @@ class GeneralContact(OfProblem, given.Sealed):
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
             self.heats = conductances_of(heat)
-            self.normal = given_normal(normal, friction, 0.0, self.heats, False)
+            self.normal = normal
+            if normal is not None:
+                from uem_dolfinx.contact.laws.soft import given_normal
+
+                self.normal = given_normal(normal, friction, 0.0, self.heats, False)
             given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
             if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")
@@ -205,7 +208,10 @@ class GeneralContact(OfProblem, given.Sealed):
     def _refuse_distant_pressures(self, config: Configuration) -> None:
         """Raise InputError for pressures at gaps beyond the reach of the search, half a facet (collective)."""
         if self.normal is not None:
-            far = AHEAD_AT_REST * float(self._skin.size[self._skin.size > 0].min())
+            from uem_dolfinx.geometry.neighbours import AHEAD_AT_REST
+
+            smallest = float(np.min(self._skin.size, where=self._skin.size > 0, initial=np.inf))
+            far = AHEAD_AT_REST * reduced(config.comm, smallest, op=MPI.MIN)
             p = self.normal.pressures(config.comm, self.name, np.array([far]), far)[0]
             if p[0] > 0.0:
                 raise InputError(

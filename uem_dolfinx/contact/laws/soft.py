@@ -121,20 +121,18 @@ class SoftContact(given.Sealed):
         return p, checked("slope", slope, -1.0)
 
 
-def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], tied: Any) -> SoftContact | None:
-    """Checked user input for the normal contact: None is hard contact.
+def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], tied: Any) -> SoftContact:
+    """Checked user input for a normal contact that is not hard.
 
     Raises:
         InputTypeError: for another type.
         InputError: beside friction, wear, heat or a tie.
     """
-    given.kind("normal", normal, normal is None or hasattr(normal, "pressures"), "a SoftContact, or None for hard contact")
-    if normal is None:
-        return None
+    found: SoftContact = given.kind("normal", normal, hasattr(normal, "pressures"), "a SoftContact, or None for hard contact")
     slides = isinstance(friction, dict) or as_law(friction).field != 0.0
     for what, there in (("friction", slides), ("wear", callable(wear) or wear), ("heat", heats), ("tied", tied)):
         if there:
             raise InputError(
                 f"{what} does not go with normal = {normal!r}, whose contactors are not united with the target: leave it out"
             )
-    return normal
+    return found

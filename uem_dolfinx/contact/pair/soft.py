@@ -42,10 +42,8 @@ HELD_FROM = 1e-6
 BISECTIONS = 30
 
 
-def interface_of(law: SoftContact | None, contact: Any) -> Callable[..., Interface]:
-    """Class of a contact's interface, which is hard without a law; InputError for a law of points, which have no areas."""
-    if law is None:
-        return Interface
+def interface_of(law: SoftContact, contact: Any) -> Callable[..., Interface]:
+    """Class of a contact's interface; InputError for a law of points, which have no areas."""
     if contact.contactor.dim == 0:
         raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
     return partial(SoftInterface, law=law, contact=contact)
