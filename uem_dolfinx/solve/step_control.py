@@ -97,7 +97,8 @@ class StepControl:
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
         # files of earlier versions have no speed
+        kept = {"largest speed": 0.0} | kept
         self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed = (
-            kept.get(name, 0.0) for name in self.to_checkpoint()
+            kept[name] for name in self.to_checkpoint()
         )
         self._read, self._longest_before = True, self.longest
