@@ -346,6 +346,28 @@ def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec
     return y
 
 
+def solve_mass(M: PETSc.Mat, rhs: PETSc.Vec, nothing: float, rtol: float) -> tuple[PETSc.Vec, int]:
+    """``M^-1 rhs`` of a mass matrix by CG, zero where its diagonal is at most this part of the largest entry (collective).
+
+    Rows without mass become rows of the identity.
+
+    Returns:
+        The solution, and KSP's reason to stop, negative without convergence.
+    """
+    diagonal = M.getDiagonal()
+    massless = diagonal.array_r <= nothing * diagonal.max()[1]
+    diagonal.array[massless], rhs.array[massless] = 1.0, 0.0
+    M.setDiagonal(diagonal)
+    ksp = PETSc.KSP().create(M.comm)
+    ksp.setType("cg")
+    ksp.getPC().setType("jacobi")
+    ksp.setTolerances(rtol=rtol, max_it=10_000)
+    ksp.setOperators(M)
+    x = rhs.duplicate()
+    ksp.solve(rhs, x)
+    return x, int(ksp.getConvergedReason())
+
+
 def free_petsc_garbage(comm: MPI.Comm) -> None:
     """Free the PETSc objects that Python has released; PETSc keeps them until then (collective)."""
     PETSc.garbage_cleanup(comm)

@@ -107,6 +107,22 @@ def test_units(scale, force):
     assert found[0] > 1e-3 and np.isclose(found[0], found[1], rtol=1e-6)
 
 
+def test_partitions_of_a_coupling():
+    """The estimate does not depend on which ranks own the nodes of a rigid coupling."""
+    found = []
+    for comm in (MPI.COMM_SELF, COMM):
+        mesh, tags = uem.read_gmsh(uem.example_mesh("two_blocks"), comm, gdim=2, parameters={"n_lower": 4, "n_upper": 7})
+        V = uem.function_space(mesh, 1, (2,))
+        u, v = fem.Function(V), ufl.TestFunction(V)
+        F = uem.LinearElastic(100.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+        plate = uem.RigidCoupling(tags["upper_top"], (0.4, 2.0), motion=(0.0, -0.05, 0.01))
+        contact = uem.Contact(tags["upper_bottom"], tags["lower_top"])
+        problem = uem.UnitedProblem(F, u, bcs=[uem.dirichlet(V, tags["lower_bottom"])], contacts=[contact], couplings=[plate])
+        list(uem.load_steps(problem, 2))
+        found.append(uem.error_estimate(problem).relative)
+    assert found[0] > 0.01 and np.isclose(found[0], found[1], rtol=1e-6)
+
+
 def test_steps_do_not_depend_on_estimates():
     """Steps after an estimate are the same."""
     ends = []

@@ -10,7 +10,7 @@ import pytest
 
 import uem_dolfinx as uem
 from uem_dolfinx.accuracy.adapt import cell_sizes
-from uem_dolfinx.geometry.mesh_sizes import SIMPLICES, MeshSizes, graded
+from uem_dolfinx.geometry.mesh_sizes import FILLED_BY, MeshSizes, graded
 
 COMM = MPI.COMM_WORLD
 
@@ -28,10 +28,10 @@ def test_sizes_grow_slowly():
     assert at[-1, 1] == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize("cell", list(SIMPLICES))
+@pytest.mark.parametrize("cell", list(FILLED_BY))
 def test_simplices_fill_cells(cell):
     """Their volumes sum up to that of the cell, and none is empty."""
-    x = basix.geometry(getattr(basix.CellType, cell))[np.array(SIMPLICES[cell])]
+    x = basix.geometry(getattr(basix.CellType, cell))[np.array(FILLED_BY[cell])]
     volumes = np.abs(np.linalg.det(x[:, 1:] - x[:, :1])) / (2.0 if x.shape[2] == 2 else 6.0)
     whole = {"triangle": 1 / 2, "quadrilateral": 1.0, "tetrahedron": 1 / 6, "hexahedron": 1.0}[cell]
     assert volumes.min() > 0 and np.isclose(volumes.sum(), whole)

@@ -41,7 +41,7 @@ class AdaptedMesh:
         cells: number of cells.
         unknowns: number of components of displacements.
         estimate: estimated error over the displacement, in the energy norm.
-        iterations: of Newton, in all steps; 0 if ``solve`` tells none.
+        iterations: of Newton, in all steps; 0 if ``solve`` returns none.
         seconds: for the mesh, the solution and the estimate.
     """
 
@@ -86,7 +86,7 @@ def adapt(
 ) -> Adaptation:
     """Solve a problem on meshes that follow its estimated error, finer and coarser, until it is small enough (collective).
 
-    All cells get the same share of the squared error. Gmsh meshes the user's own geometry anew with these sizes, so that curved
+    All cells get the same share of the squared error. Gmsh meshes the user's own geometry again with these sizes, so that curved
     boundaries stay curved. Histories run again on every mesh.
 
     Args:
@@ -136,7 +136,9 @@ def adapt(
         reached = enough(found, tolerance, cells)
         if reached or len(found) == meshes:
             if not reached:
-                logger.warning("%d meshes do not reach what adapt was asked for: allow more meshes, or a larger error", meshes)
+                logger.warning(
+                    "%d meshes do not reach the tolerance or the number of cells: allow more meshes, or a larger error", meshes
+                )
             return Adaptation(problem, estimate, found, reached)
         mesh = problem.config.mesh
         wanted = None if tolerance is None else (AIM * tolerance * estimate.norm) ** 2

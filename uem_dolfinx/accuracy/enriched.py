@@ -111,21 +111,15 @@ class Enriched:
 
         A facet of the outside is held in a component if all nodes of the displacement on it are, by conditions or by rigid couplings.
         """
-        problem = self.problem
-        config, V = problem.config, problem.config.u.function_space
+        problem, dim = self.problem, self.problem.config.tdim - 1
         held = problem.bodies.held.reshape(-1, self.g).copy()
         for coupling in problem.couplings:
             held[coupling.nodes.nodes] = True
-        flags = fem.Function(self.W)
-        view = flags.x.array.reshape(-1, self.g)
-        _, of_cell = outside(config)
-        nodes = compat.cell_dofs(V)
-        for i in np.unique(of_cell[:, 1]):
-            cells = of_cell[of_cell[:, 1] == i, 0]
-            own, finer = (
-                np.asarray(space.dofmap.dof_layout.entity_closure_dofs(config.tdim - 1, int(i))) for space in (V, self.W)
-            )
-            all_held = held[nodes[cells][:, own]].all(axis=1)
-            np.add.at(view, self.cells[cells][:, finer].ravel(), np.repeat(all_held, len(finer), axis=0))
-        forms.sum_ghosts(flags)
-        return np.array(view > 0.0)
+        held = problem.bodies.of_owners(held.ravel()).reshape(held.shape)
+        facets, nodes = outside(problem.config)
+        whole: Bools = np.asarray(held[nodes].all(axis=1))
+        found = np.zeros((int(self.cells.max(initial=-1)) + 1, self.g), dtype=bool)
+        for k in range(self.g):
+            # nodes of facets of other ranks as well
+            found[fem.locate_dofs_topological(self.W, dim, facets[whole[:, k]]), k] = True
+        return found

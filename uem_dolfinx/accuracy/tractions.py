@@ -8,11 +8,12 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
-from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Indices
+from uem_dolfinx.arrays import Array, Indices, Ints
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Residual of the tractions' mass matrix, whose condition does not depend on the mesh.
@@ -35,29 +36,19 @@ def contact_tractions(problem: UnitedProblem) -> tuple[fem.Function, Any] | None
     for contact in problem.contacts:
         force += contact.force.x.array
     facets = _surfaces(problem, force.reshape(-1, config.gdim))
-    comm = config.comm
-    if not comm.allreduce(len(facets)):
+    if not reduced(config.comm, len(facets)):
         return None
     ds = forms.surface_measure(config.mesh, facets)
     trial, test = ufl.TrialFunction(V), ufl.TestFunction(V)
     mass = forms.form(ufl.inner(trial, test) * ds + fem.Constant(config.mesh, 0.0) * ufl.inner(trial, test) * ufl.dx)
     M = forms.create_matrix(mass)
     forms.assemble_matrix(M, mass)
-    diagonal = M.getDiagonal()
-    beyond = diagonal.array_r == 0.0
-    diagonal.array[beyond] = 1.0
-    M.setDiagonal(diagonal)
-    t = fem.Function(V)
-    rhs, solution = compat.create_vector(V), compat.petsc_vector(t)
-    rhs.array[:] = np.where(beyond, 0.0, force[: len(beyond)])
-    ksp = PETSc.KSP().create(config.comm)
-    ksp.setOperators(M)
-    ksp.setType("cg")
-    ksp.getPC().setType("jacobi")
-    ksp.setTolerances(rtol=SOLVED, atol=0.0)
-    ksp.solve(rhs, solution)
+    t, rhs = fem.Function(V), M.createVecLeft()
+    rhs.array[:] = force[: len(rhs.array_r)]
+    found, _ = forms.solve_mass(M, rhs, 0.0, SOLVED)
+    t.x.array[: len(found.array_r)] = found.array_r
     t.x.scatter_forward()
-    for one in (ksp, M, rhs):
+    for one in (M, rhs, found):
         one.destroy()
     return t, ds
 
@@ -77,23 +68,16 @@ def _surfaces(problem: UnitedProblem, force: Array) -> Indices:
 
 def _loaded(problem: UnitedProblem, force: Array) -> Indices:
     """Facets of the outside with a contact force at any node."""
-    config = problem.config
-    facets, of_cell = outside(config)
-    cells, loaded = compat.cell_dofs(config.u.function_space), (force != 0.0).any(axis=1)
-    layout = config.u.function_space.dofmap.dof_layout
-    closure = [np.asarray(layout.entity_closure_dofs(config.tdim - 1, i)) for i in range(int(of_cell[:, 1].max(initial=-1)) + 1)]
-    return facets[[bool(loaded[cells[cell, closure[i]]].any()) for cell, i in of_cell]]
+    facets, nodes = outside(problem.config)
+    return np.asarray(facets[(force != 0.0).any(axis=1)[nodes].any(axis=1)])
 
 
-def outside(config: Any) -> tuple[Indices, Any]:
-    """Facets of the outside on this rank ``(n,)``, and the cell of each with its number in the cell ``(n, 2)``."""
-    topology, tdim = config.mesh.topology, config.tdim
-    topology.create_connectivity(tdim - 1, tdim)
-    topology.create_connectivity(tdim, tdim - 1)
-    facets = np.asarray(exterior_facet_indices(topology), dtype=np.int32)
-    n_facets = len(forms.reference_topology(compat.cell_name(config.mesh))[tdim - 1])
-    sides = compat.cell_table(topology.connectivity(tdim, tdim - 1), n_facets)
-    to_cells = topology.connectivity(tdim - 1, tdim)
-    cells = np.array([to_cells.links(f)[0] for f in facets], dtype=np.int64)
-    local = np.argmax(sides[cells] == facets[:, None], axis=1) if len(facets) else np.zeros(0, np.int64)
-    return facets, np.column_stack([cells, local])
+def outside(config: Configuration) -> tuple[Indices, Ints]:
+    """Facets of the outside on this rank ``(n,)``, and the nodes of the displacement on each ``(n, k)``."""
+    mesh, V, dim = config.mesh, config.u.function_space, config.tdim - 1
+    mesh.topology.create_connectivity(dim, config.tdim)
+    facets = np.asarray(exterior_facet_indices(mesh.topology), dtype=np.int32)
+    cells, sides = forms.cells_of_facets(mesh, facets)
+    layout, number = V.dofmap.dof_layout, len(forms.reference_topology(compat.cell_name(mesh))[dim])
+    closure = np.array([layout.entity_closure_dofs(dim, i) for i in range(number)])
+    return facets, compat.cell_dofs(V)[cells[:, None], closure[sides]].astype(np.int64)

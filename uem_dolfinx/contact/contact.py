@@ -20,6 +20,7 @@ from uem_dolfinx.contact.laws.law import (
     follows_load,
     given_field,
     given_friction,
+    given_normal,
     of_rate,
     parameters,
     values_at,
@@ -141,11 +142,7 @@ class Contact(WatchedContact, given.Sealed):
             chords = given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
             self.heats = conductances_of(heat)
-            self.normal = normal
-            if normal is not None:
-                from uem_dolfinx.contact.laws.soft import given_normal
-
-                self.normal = given_normal(normal, friction, wear, self.heats, tied)
+            self.normal = given_normal(normal, friction, wear, self.heats, tied)
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
             if not isinstance(adjust, (bool, np.bool_)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
+from uem_dolfinx import forms
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.log import timed
@@ -36,20 +37,8 @@ def united_accelerations(
     if added is not None:
         M.axpy(1.0, added.PtAP(restriction.P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
     rhs = restriction.transpose(forces)
-    diagonal = M.getDiagonal()
-    massless = diagonal.array_r <= MASSLESS * diagonal.max()[1]
-    diagonal.array[massless], rhs.array[massless] = 1.0, 0.0
-    M.setDiagonal(diagonal)
-    ksp = PETSc.KSP().create(M.comm)
-    ksp.setType("cg")
-    ksp.getPC().setType("jacobi")
-    ksp.setTolerances(rtol=ACCELERATED, max_it=10_000)
-    ksp.setOperators(M)
-    q = rhs.duplicate()
     with timed("first acceleration"):
-        ksp.solve(rhs, q)
-    if ksp.getConvergedReason() < 0:
-        raise LinearSolveError(
-            f"the first acceleration was not found (KSP reason {ksp.getConvergedReason()}): check that no mass is negative"
-        )
+        q, reason = forms.solve_mass(M, rhs, MASSLESS, ACCELERATED)
+    if reason < 0:
+        raise LinearSolveError(f"the first acceleration was not found (KSP reason {reason}): check that no mass is negative")
     return restriction.expand(q)

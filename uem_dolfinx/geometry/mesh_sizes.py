@@ -12,7 +12,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
 
 #: Simplices that fill a cell, by its vertices in DOLFINx's order.
-SIMPLICES = {
+FILLED_BY = {
     "triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]], "tetrahedron": [[0, 1, 2, 3]],
     "hexahedron": [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]],
 }  # fmt: skip
@@ -58,7 +58,7 @@ class MeshSizes:
         """Mesh with these sizes, on rank 0."""
         before = {name: gmsh.option.getNumber(name) for name in OTHERS}
         view = gmsh.view.add("sizes")
-        corners = np.array(SIMPLICES[self.cell])
+        corners = np.array(FILLED_BY[self.cell])
         gdim, k = self.points.shape[2], corners.shape[1]
         points, values = self.points[:, corners].reshape(-1, k, gdim), self.values[:, corners].reshape(-1, k)
         x = np.zeros((len(points), 3, k))

@@ -15,13 +15,12 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.mesh_sizes import FILLED_BY
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.output.sections import Shape, rigid_shapes, sections, solid_cells
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
-#: Gmsh and DOLFINx nodes of a cell's triangles, by cell.
-TRIANGLES = {"triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]]}
 #: Vertices in their order around a facet or a 2D cell, by their number.
 AROUND = {2: [0, 1], 3: [0, 1, 2], 4: [0, 1, 3, 2]}
 
@@ -172,7 +171,7 @@ def vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
     name, owned = compat.cell_name(mesh), mesh.topology.index_map(2).size_local
     dofs = compat.cell_dofs(compat.function_space(mesh, 1))[:owned].astype(np.int64)
     around = AROUND[dofs.shape[1]]
-    return np.concatenate([dofs[:, t] for t in TRIANGLES[name]]), dofs[:, [*around, around[0]]]
+    return np.concatenate([dofs[:, t] for t in FILLED_BY[name]]), dofs[:, [*around, around[0]]]
 
 
 def boundary(mesh: Any, surface: Part | None = None) -> Ints:

@@ -23,7 +23,7 @@ from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, Rigid
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
-from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction, given_normal
 from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -110,11 +110,7 @@ class GeneralContact(OfProblem, given.Sealed):
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
             self.heats = conductances_of(heat)
-            self.normal = normal
-            if normal is not None:
-                from uem_dolfinx.contact.laws.soft import given_normal
-
-                self.normal = given_normal(normal, friction, 0.0, self.heats, False)
+            self.normal = given_normal(normal, friction, 0.0, self.heats, False)
             given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
             if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")

@@ -8,7 +8,7 @@ with the same attributes, passed to ``Contact`` as ``friction``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from inspect import signature
 from typing import Any, Protocol, TypeAlias, TypeGuard, cast
 
@@ -99,6 +99,23 @@ def given_friction(friction: Any) -> Field | FrictionLaw:
     if not callable(law.field):
         given.number("friction", law.field, given.NOT_NEGATIVE)
     return law if hasattr(friction, "limit") else law.field
+
+
+def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], tied: Any) -> Any:
+    """Checked user input for the normal contact: a ``SoftContact``, or None for hard contact.
+
+    Raises:
+        InputTypeError: for another type.
+        InputError: for a soft contact with friction, wear, heat or a tie.
+    """
+    given.kind("normal", normal, normal is None or hasattr(normal, "pressures"), "a SoftContact, or None for hard contact")
+    slides = isinstance(friction, dict) or as_law(friction).field != 0.0
+    for what, there in (("friction", slides), ("wear", callable(wear) or wear), ("heat", heats), ("tied", tied)):
+        if normal is not None and there:
+            raise InputError(
+                f"{what} does not go with normal = {normal!r}, whose contactors are not united with the target: leave it out"
+            )
+    return normal
 
 
 def given_field(what: str, value: Any, within: given.Range = given.FINITE) -> Field:

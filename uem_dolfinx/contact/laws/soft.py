@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.laws.linear import Linear
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import agreed, ask_together
@@ -77,7 +76,7 @@ class SoftContact(given.Sealed):
 
     def __init__(self, p: OfGap, slope: Callable[[Array], npt.ArrayLike] | None = None):
         if slope is not None:
-            given.kind("slope", slope, callable(slope) and callable(p), "a function of gaps, beside a function p", "leave it out")
+            given.kind("slope", slope, callable(slope) and callable(p), "a function of gaps, for a function p", "leave it out")
         if hasattr(p, "pressure"):
             self.law: PressureLaw = given.kind("p", p, not isinstance(p, type), "a law", "make the law with its numbers")
         elif callable(p):
@@ -119,20 +118,3 @@ class SoftContact(given.Sealed):
             behind, ahead = (checked("p", side, 1.0) for side in sides)
             slope = (ahead - behind) / (2.0 * step)
         return p, checked("slope", slope, -1.0)
-
-
-def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], tied: Any) -> SoftContact:
-    """Checked user input for a normal contact that is not hard.
-
-    Raises:
-        InputTypeError: for another type.
-        InputError: beside friction, wear, heat or a tie.
-    """
-    found: SoftContact = given.kind("normal", normal, hasattr(normal, "pressures"), "a SoftContact, or None for hard contact")
-    slides = isinstance(friction, dict) or as_law(friction).field != 0.0
-    for what, there in (("friction", slides), ("wear", callable(wear) or wear), ("heat", heats), ("tied", tied)):
-        if there:
-            raise InputError(
-                f"{what} does not go with normal = {normal!r}, whose contactors are not united with the target: leave it out"
-            )
-    return found
