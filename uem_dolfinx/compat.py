@@ -122,8 +122,8 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
 
     Args:
         domain: the mesh.
-        element: degree of a continuous Lagrange space, or ``(family, degree)`` or ``(family, degree, shape)``, as ``("DG", 0)``; several
-            of these in a list make a mixed space, as ``[("Lagrange", 2, (2,)), 1]`` of a displacement and a pressure.
+        element: degree of a continuous Lagrange space, or ``(family, degree)`` or ``(family, degree, shape)``, as ``("DG", 0)`` or
+            ``("Quadrature", 2)`` at points of integration; several in a list make a mixed space, ``[("Lagrange", 2, (2,)), 1]``.
         shape: shape of the value: ``()`` scalar, ``(2,)`` vector, ``(2, 2)`` tensor.
 
     Raises:
@@ -141,6 +141,8 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
     if not whole:
         raise InputError(f"shape = {shape!r}: expected whole numbers, 1 or more, in brackets, as (2,)")
     try:
+        if given[0] == "Quadrature":
+            return quadrature_space(domain, int(given[1]), tuple(shape))
         return _space(domain, given[0], int(given[1]), tuple(shape))
     except Exception as error:  # of which class depends on the version of UFL
         raise InputError(f"element = {element!r} ({error}): expected a family and a degree that DOLFINx knows") from error
@@ -167,17 +169,17 @@ def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any
 
 
 def quadrature_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any:
-    """Space of functions known at the points of :func:`forms.quadrature_rule`, in their order; ``shape`` is ``()`` or ``(n,)``."""
+    """Space of functions known at the points of :func:`forms.quadrature_rule`, in their order; ``shape`` as in ``function_space``."""
     if DOLFINX_VERSION >= (0, 7):
         from basix.ufl import quadrature_element
 
         element = quadrature_element(cell_name(domain), value_shape=tuple(shape), scheme="default", degree=degree)
         return fem.functionspace(domain, element)
-    if shape == ():
-        element = ufl.FiniteElement("Quadrature", domain.ufl_cell(), degree, quad_scheme="default")
-    else:
-        element = ufl.VectorElement("Quadrature", domain.ufl_cell(), degree, dim=shape[0], quad_scheme="default")
-    return fem.FunctionSpace(domain, element)
+    kind, more = (
+        (ufl.FiniteElement, {}) if not shape else (ufl.VectorElement, {"dim": shape[0]}) if len(shape) == 1
+        else (ufl.TensorElement, {"shape": tuple(shape)})
+    )  # fmt: skip
+    return fem.FunctionSpace(domain, kind("Quadrature", domain.ufl_cell(), degree, quad_scheme="default", **more))
 
 
 def evaluate(compiled: fem.Expression, domain: Any, cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
@@ -273,24 +275,22 @@ def compile_expression(expression: Any, points: npt.NDArray[np.float64]) -> fem.
         return fem.Expression(expression, points)
 
 
-def interpolate_expression(u: Any, expression: Any) -> None:
-    """Interpolate a UFL expression into a Function of a Lagrange or DG0 space, ghosts included (collective)."""
-    V = u.function_space
-    one = fem.Constant(V.mesh, 1.0)
-    if not ufl.domain.extract_domains(expression):
-        expression = ufl.as_ufl(expression) * one
+def interpolation_points(V: Any) -> npt.NDArray[np.float64]:
+    """Points of the reference cell ``(n, tdim)`` whose values determine a Function of a Lagrange or DG space."""
     points = V.element.interpolation_points
-    if callable(points):
-        points = points()
-    compiled = compile_expression(expression, points)
+    return np.asarray(points() if callable(points) else points)
+
+
+def interpolate_compiled(u: Any, compiled: fem.Expression) -> None:
+    """Interpolate an expression, compiled for the points of its space, into a Function of a Lagrange or DG space."""
     if DOLFINX_VERSION >= (0, 6) and hasattr(compiled, "_cpp_object"):
         u.interpolate(compiled)
     else:
-        u._cpp_object.interpolate(compiled._cpp_object, _all_cells(V.mesh))
-    u.x.scatter_forward()
+        u._cpp_object.interpolate(compiled._cpp_object, all_cells(u.function_space.mesh))
 
 
-def _all_cells(domain: Any) -> npt.NDArray[np.int32]:
+def all_cells(domain: Any) -> npt.NDArray[np.int32]:
+    """Local numbers of all cells, ghosts included."""
     cells = domain.topology.index_map(domain.topology.dim)
     return np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
 

@@ -5,7 +5,7 @@ Calls that are the same in all versions of DOLFINx, but would have to be repeate
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -293,6 +293,34 @@ def _of_common_tags(F: ufl.Form, integrals: Sequence[Any]) -> tuple[list[Any], l
         ids = tuple(j for j, row in enumerate(known, 1) if any(row[k] for k in columns)) or (len(known) + 1,)
         out.append(integral.reconstruct(subdomain_data=tags, subdomain_id=ids if own else "everywhere"))
     return out, [tags]
+
+
+def interpolation(u: Any, expression: Any) -> Callable[[], None]:
+    """A UFL expression compiled to be interpolated into a Function of a Lagrange, DG or quadrature space.
+
+    Returns:
+        Function without arguments that interpolates its present values, ghosts included (collective).
+    """
+    V = u.function_space
+    domain = V.mesh
+    if not ufl.domain.extract_domains(expression):
+        expression = ufl.as_ufl(expression) * fem.Constant(domain, 1.0)
+    family, degree = compat.element_family(V) or ("", 0)
+    at_points = family == "Quadrature"
+    points = quadrature_rule(compat.cell_name(domain), degree)[0] if at_points else compat.interpolation_points(V)
+    compiled = compat.compile_expression(expression, points)
+
+    def interpolate() -> None:
+        if at_points:
+            cells = compat.all_cells(domain)
+            if len(cells):
+                values = u.x.array.reshape(-1, V.dofmap.bs)
+                values[compat.cell_dofs(V)] = compat.evaluate(compiled, domain, cells)
+        else:
+            compat.interpolate_compiled(u, compiled)
+        u.x.scatter_forward()
+
+    return interpolate
 
 
 def create_matrix(a: Any) -> PETSc.Mat:

@@ -6,7 +6,6 @@ from numbers import Number
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
@@ -24,9 +23,11 @@ def dirichlet(
     V: fem.FunctionSpace,
     tag: Part,
     component: int | None = None,
-    value: float | npt.ArrayLike | fem.Constant | fem.Function = 0.0,
+    value: Any = 0.0,
 ) -> fem.DirichletBC:
     """Prescribe the displacement, or one component of it, at all nodes of a part of the mesh (collective).
+
+        uem.dirichlet(V, tags["edge"], 1, lambda x, t: 0.1 * t * np.sin(np.pi * x[0]))
 
     Args:
         V: a Lagrange space with ``size`` components, or a part of a mixed space, e.g. ``W.sub(0)``.
@@ -34,7 +35,10 @@ def dirichlet(
         component: 0 is x; None prescribes all components.
         value: a number, or for all components a vector ``(size,)``; or a Constant of one of these shapes, or a Function of ``V``
             (for one component of a scalar space of the same degree), both of which may be changed between steps. A vector part of a
-            mixed space needs one condition per component.
+            mixed space needs one condition per component. Or a function of the places x ``(3, n)``, as in DOLFINx's ``interpolate``,
+            which returns ``(n,)``, or for all components ``(size, n)``; with a second argument it is a function of the load factor
+            or time, which needs no ``load`` and is not ramped. Or a UFL expression, such as the component ``w[1]`` of a Function, which
+            is evaluated in every step.
 
     Returns:
         DOLFINx's Dirichlet condition.
@@ -43,6 +47,7 @@ def dirichlet(
         SpaceError: ``V`` is no Lagrange space, or the tag or the Function does not belong to it.
         TagError: the tag is empty, or cannot be read.
         InputError, InputTypeError: no such component, or a value of another shape or not finite.
+        UserFunctionError: if a function raises.
     """
     mesh = given.kind("V", V, hasattr(V, "dofmap"), "a function space, as u.function_space").mesh
     with agreed(mesh.comm):
@@ -51,11 +56,24 @@ def dirichlet(
     tag = as_tag(tag, mesh, (tdim - 1, *range(tdim + 1)), "the support")
     part = compat.is_part(V)
     sub = V if component is None or V.num_sub_spaces < 2 else V.sub(int(component))
+    if not isinstance(value, (fem.Function, fem.Constant)) and (isinstance(value, Expr) or callable(value)):
+        return _by_rule(V, tag, component, value, sub is V and not part)
     if not isinstance(value, fem.Function):
         return compat.dirichletbc(value, locate_dofs(sub, tag), sub)
     if sub is V and not part:
         return fem.dirichletbc(value, locate_dofs(V, tag))
     return compat.dirichletbc(value, locate_dofs((sub, value.function_space), tag), sub)
+
+
+def _by_rule(V: Any, tag: Tag, component: int | None, value: Any, whole: bool) -> fem.DirichletBC:
+    """A condition whose values follow a function or an expression (collective)."""
+    from uem_dolfinx.conditions.prescribed import Rule
+
+    values = fem.Function(V if whole else compat.function_space(V.mesh, compat.highest_degree(V)))
+    bc = dirichlet(V, tag, component, values)
+    bc.rule = Rule(value, values, locate_dofs(values.function_space, tag), str(tag.name))
+    bc.rule.take_load(V.mesh.comm, 0.0)
+    return bc
 
 
 def _checked(V: Any, component: int | None, value: Any) -> Any:
@@ -74,6 +92,15 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
     if component is not None and component not in range(size):
         raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
     n = size if component is None else 1
+    if isinstance(value, fem.Function) and value.ufl_shape == (size,) and n == 1 < size:
+        value = value[component]
+    if isinstance(value, Expr) and not isinstance(value, (fem.Function, fem.Constant)):
+        if value.ufl_shape != ((n,) if n > 1 else ()):
+            raise InputError(f"a Dirichlet condition for {n} components has a value of the shape {value.ufl_shape}: expected {n}")
+        check_values("the value of a Dirichlet condition", value, V.mesh.ufl_domain(), "the mesh of V")
+        return value
+    if callable(value) and not isinstance(value, Expr):
+        return value
     if isinstance(value, fem.Function):
         own, array = value.function_space, value.x.array
         scalar = own.dofmap.index_map_bs == 1 and compat.lagrange_degree(own) == degree and own.mesh is V.mesh
@@ -128,7 +155,9 @@ def _mesh_of(part: Part, mesh: Any) -> Any:
 
 
 def interpolate(u: fem.Function, expression: Any) -> None:
-    """Interpolate a UFL expression, or a number, into a Function of a Lagrange or DG0 space, ghosts included (collective).
+    """Interpolate a UFL expression, or a number, into a Function of a Lagrange, DG or quadrature space, ghosts included (collective).
+
+    At points that several cells share, one of them gives the value of an expression that jumps there.
 
     Raises:
         InputTypeError: if ``u`` is no Function, or the expression no UFL expression.
@@ -145,10 +174,12 @@ def interpolate(u: fem.Function, expression: Any) -> None:
         raise InputError(
             f"expression has the shape {expression.ufl_shape}: expected {u.ufl_shape}, that of u; take a component, or ufl.as_vector"
         )
-    if (compat.element_family(V) or ("",))[0] not in ("Lagrange", "Discontinuous Lagrange"):
-        raise SpaceError("u is of a space without nodal values: expected a Lagrange or DG space; make it by uem.function_space")
+    if (compat.element_family(V) or ("",))[0] not in ("Lagrange", "Discontinuous Lagrange", "Quadrature"):
+        raise SpaceError(
+            "u is of a space without nodal values: expected a Lagrange, DG or quadrature space; make it by uem.function_space"
+        )
     check_values("expression", expression, V.mesh.ufl_domain(), "the mesh of u")
-    compat.interpolate_expression(u, expression)
+    forms.interpolation(u, expression)()
 
 
 def integrate(integrals: ufl.Form | fem.Form) -> float:

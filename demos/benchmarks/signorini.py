@@ -133,7 +133,7 @@ def signorini(
     for i in range(2):
         V_i, _ = V.sub(i).collapse()
         value = fem.Function(V_i)
-        compat.interpolate_expression(value, u_exact[i])
+        forms.interpolation(value, u_exact[i])()
         dofs = fem.locate_dofs_topological((V.sub(i), V_i), 1, outside)
         if i == 1:
             ends = fem.locate_dofs_topological((V.sub(i), V_i), 1, tags[surfaces[contactor]].entities)[0]
@@ -156,7 +156,7 @@ def signorini(
     }
     compiled = {name: tuple(map(forms.form, pair)) for name, pair in parts.items()}
     largest = fem.Function(V)
-    compat.interpolate_expression(largest, u_exact)
+    forms.interpolation(largest, u_exact)()
     size = float(max(comm.allgather(np.abs(largest.x.array).max(initial=0.0))))
 
     def errors(problem: uem.UnitedProblem, contact: uem.Contact, steps: list[Any]) -> dict[str, float | None]:

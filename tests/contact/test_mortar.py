@@ -18,7 +18,7 @@ from helpers import CELLS, M, at, box, clamp, complementary, factors, highest, l
 from mortar_scenes import COMM, Blocks, disturbed
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 
 # -- the patch test ------------------------------------------------------------------------------------------------------
 
@@ -36,7 +36,7 @@ def test_patch_on_any_meshes(cell, n, seed, degree, contactor):
     steps = run(b.pressed(p))
     stress = fem.Function(compat.function_space(b.scene.mesh, ("DG", 0)))
     law = uem.LinearElastic(b.E, 0.3, kind="plane_strain" if b.g == 2 else "3d")
-    compat.interpolate_expression(stress, law.stress(b.u)[b.g - 1, b.g - 1])
+    forms.interpolation(stress, law.stress(b.u)[b.g - 1, b.g - 1])()
     assert highest(COMM, np.abs(stress.x.array / p + 1)) < 1e-11
     x = b.contact.pair.config.X
     lower = x[:, -1] < -1e-9

@@ -20,7 +20,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from helpers import at, blocks, clamp, highest, linear, modulus, outside_mpi, raised, serial
+from helpers import at, blocks, clamp, highest, linear, modulus, outside_mpi, raised, refused, serial
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
@@ -315,6 +315,27 @@ def test_interpolation_and_timing():
     assert rows[0][:2] == ["seconds", "times"] and seconds == sorted(seconds, reverse=True) and len(seconds) == len(uem.timings())
 
 
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_interpolation_into_every_space(cell):
+    """A cubic polynomial is exact where its degree is, or at the points of a rule; integrals by the points are those of the form."""
+    mesh = blocks(COMM, cell).scene.mesh
+    x = ufl.SpatialCoordinate(mesh)
+    p, n = 1 + x[0] ** 2 * x[1], 7
+    exact = uem.integrate(p * ufl.dx)
+    for space in (("Lagrange", 3), ("DG", 3)):
+        f = fem.Function(uem.function_space(mesh, space))
+        uem.interpolate(f, p)
+        assert uem.integrate((f - p) ** 2 * ufl.dx) == pytest.approx(0.0, abs=1e-25)
+    for shape, expression in (((), p), ((n,), ufl.as_vector([k * p for k in range(n)])), ((2, 2), p * ufl.Identity(2))):
+        f = fem.Function(uem.function_space(mesh, ("Quadrature", 4), shape))
+        uem.interpolate(f, expression)
+        rule = {"quadrature_degree": 4, "quadrature_scheme": "default"}
+        found = {0: lambda f: f, 1: lambda f: f[n - 1] / (n - 1), 2: lambda f: f[1, 1] + 3 * f[0, 1]}[len(shape)](f)
+        assert uem.integrate(found * ufl.dx(metadata=rule)) == pytest.approx(exact, rel=1e-13)
+    other = fem.Function(uem.function_space(mesh, ("RT" if cell == "triangle" else "RTCF", 1)))
+    refused(uem.SpaceError, "Lagrange, DG or quadrature", lambda: uem.interpolate(other, ufl.as_vector([p, p])))
+
+
 # -- what scripts and logs see -----------------------------------------------------------------------------------------
 
 
@@ -427,7 +448,7 @@ def test_dirichlet_of_what_cannot_be():
     b, other = blocks(COMM, "triangle"), blocks(COMM, "triangle")
     last = COMM.rank == COMM.size - 1
     V, top = b.V, b.top
-    scalar = fem.Function(uem.function_space(b.scene.mesh, 1))
+    scalar, constant = (fem.Function(uem.function_space(b.scene.mesh, one)) for one in (1, ("DG", 0)))
     for error, match, given in (
         (ValueError, "component = 2: expected one of 0 to 1", (V, top, 2)),
         (ValueError, "component = -1", (V, top, -1)),
@@ -440,7 +461,7 @@ def test_dirichlet_of_what_cannot_be():
         (ValueError, "2 components.*shape \\(\\)", (V, top, None, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0)))),
         (uem.SpaceError, "is no Function of", (V, top, None, fem.Function(other.V))),
         (uem.SpaceError, "is no Function of", (V, top, None, scalar)),
-        (uem.SpaceError, "is no Function of a scalar Lagrange space of degree 1", (V, top, 0, b.u)),
+        (uem.SpaceError, "is no Function of a scalar Lagrange space of degree 1", (V, top, 0, constant)),
         (uem.SpaceError, "whole Lagrange space", (V.sub(0), top, None)),
         (uem.SpaceError, "whole Lagrange space", (uem.function_space(b.scene.mesh, ("DG", 0), (2,)), top)),
         (uem.SpaceError, "another mesh", (V, other.top)),

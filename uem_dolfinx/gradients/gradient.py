@@ -16,6 +16,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.conditions.prescribed import rules_of
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
@@ -25,7 +26,7 @@ from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
-from uem_dolfinx.solve.loading import holds, set_by_load
+from uem_dolfinx.solve.loading import holds, set_by
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.system import BodySystem
 
@@ -284,8 +285,13 @@ def refuse_idle_controls(
         if not isinstance(m, (fem.Constant, fem.Function)):
             continue
         held = any(m is one for form in forms for one in (*form.constants(), *form.coefficients()))
-        held = held or holds(beside, m) or bool(set_by_load({m: 0.0}, bcs, n).any())
+        held = held or holds(beside, m) or bool(set_by([m], bcs, n).any())
         with agreed(problem.comm):
+            if holds([rule.value for rule in rules_of(bcs)], m):
+                raise InputError(
+                    f"{what}[{i}], {given.described(m)}, is in a Dirichlet value by a function or an expression, which has no derivative "
+                    "here: expected it as the value itself, uem.dirichlet(V, tag, component, m)"
+                )
             if not reduced(problem.comm, held, op=MPI.LOR):
                 raise InputError(
                     f"{what}[{i}], {given.described(m)}, is in no form, Dirichlet condition or law of the problem, nor in J: expected "

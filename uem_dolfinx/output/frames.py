@@ -145,7 +145,7 @@ def nodal_average(expression: Any, mesh: Any) -> Array:
     S = compat.function_space(mesh, 1)
     v, total = ufl.TestFunction(S), fem.Function(S)
     cells = fem.Function(compat.function_space(mesh, ("DG", 0)))
-    compat.interpolate_expression(cells, expression)
+    forms.interpolation(cells, expression)()
     sums = []
     for weight in (cells, fem.Constant(mesh, 1.0)):
         own = forms.assemble_array(S, forms.form(weight * v * ufl.dx))

@@ -11,6 +11,7 @@ from dolfinx import fem
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.conditions.prescribed import rules_of
 from uem_dolfinx.geometry.rigid import RigidSurface
 from uem_dolfinx.solve.loading import set_loads
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -54,6 +55,7 @@ def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
         if one is not problem.u and isinstance(one, (fem.Constant, fem.Function))
     ]
     terms += load if isinstance(load, Mapping) else []
+    terms += [rule.values for rule in rules_of(problem.bodies.bcs)]
     kept = [(forms.values_of(one), np.array(forms.values_of(one))) for one in terms]
     targets = [contact.target for contact in problem.contacts if isinstance(contact.target, RigidSurface)]
     motions = [target.motion for target in targets]
@@ -71,6 +73,6 @@ def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
 
 def _set_load(problem: UnitedProblem, at: float) -> None:
     """Set a problem's ``load`` and its couplings at a load factor or time, but not its contacts (collective)."""
-    set_loads(problem.comm, problem.load, at)
+    set_loads(problem.comm, problem.load, at, problem.bodies.bcs)
     for one in problem.couplings:
         one.take_load(at)

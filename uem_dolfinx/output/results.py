@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx import compat, given
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError
@@ -203,6 +203,7 @@ class ResultsWriter(Closing, given.Sealed):
         self._expressions = dict(fields or {})
         spaces = {name: compat.function_space(mesh, ("DG", 0), e.ufl_shape) for name, e in self._expressions.items()}
         self._cellwise = {name: fem.Function(space, name=name) for name, space in spaces.items()}
+        self._interpolations = [forms.interpolation(out, self._expressions[name]) for name, out in self._cellwise.items()]
         from uem_dolfinx.output.xdmf import geometry_degree
 
         degree, sources = geometry_degree(mesh), self._sources()
@@ -312,8 +313,8 @@ class ResultsWriter(Closing, given.Sealed):
                     out = self._nodal[name]
                     out.interpolate(u)
                     out.x.scatter_forward()
-                for name, out in self._cellwise.items():
-                    compat.interpolate_expression(out, self._expressions[name])
+                for interpolate in self._interpolations:
+                    interpolate()
                 self._xdmf.write(time, steps)
                 for writer in self._vtx:
                     writer.write(time)

@@ -21,6 +21,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.conditions.prescribed import rules_of
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
@@ -73,8 +74,8 @@ def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
     return load if load is None or isinstance(load, ByFunction) else ByFunction(load)
 
 
-def set_loads(comm: MPI.Comm, load: Any, at: float) -> None:
-    """Apply a problem's ``load`` at a load factor or time; None sets nothing (collective).
+def set_loads(comm: MPI.Comm, load: Any, at: float, bcs: Sequence[Any] = ()) -> None:
+    """Apply a problem's ``load``, and Dirichlet values by rules, at a load factor or time; None sets nothing (collective).
 
     Raises:
         InputError, InputTypeError: if the value of a Constant is not finite, or of another shape.
@@ -87,6 +88,8 @@ def set_loads(comm: MPI.Comm, load: Any, at: float) -> None:
                 constant.value = _fitting(constant, now)
     elif load is not None:
         ask_together(comm, f"load({at:.6g})", load, at)
+    for rule in rules_of(bcs):
+        rule.take_load(comm, at)
 
 
 def _fitting(constant: fem.Constant, value: Any) -> Any:
@@ -124,16 +127,22 @@ def forget_load(problem: Any) -> None:
 
 
 def set_by_load(load: Any, bcs: Sequence[Any], n: int) -> Bools:
-    """Mask of unknowns ``(n,)`` whose Dirichlet values are Constants set by a load; all False for a function as load."""
+    """Mask of unknowns ``(n,)`` whose Dirichlet values a load sets as Constants, or rules of the load factor; see ``set_by``."""
     constants = list(load) if isinstance(load, Mapping) else []
-    kept, found = [np.array(forms.values_of(c)) for c in constants], np.zeros((2, n))
+    led = [rule.values for rule in rules_of(bcs) if rule.of_load or any(holds(rule.value, c) for c in constants)]
+    return set_by([*constants, *led], bcs, n)
+
+
+def set_by(some: Sequence[fem.Constant | fem.Function], bcs: Sequence[Any], n: int) -> Bools:
+    """Mask of unknowns ``(n,)`` whose Dirichlet values are these Constants and Functions."""
+    kept, found = [np.array(forms.values_of(c)) for c in some], np.zeros((2, n))
     try:
-        for k, values in enumerate(found if constants else ()):
-            for c in constants:
+        for k, values in enumerate(found if some else ()):
+            for c in some:
                 forms.values_of(c)[...] = float(k)
             compat.set_bc_values(values, bcs)
     finally:
-        for c, value in zip(constants, kept):
+        for c, value in zip(some, kept):
             forms.values_of(c)[...] = value
     with np.errstate(invalid="ignore"):
         return np.asarray(found[1] - found[0] == 1.0)
@@ -169,7 +178,8 @@ def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load",
     if not isinstance(load, Mapping):
         return
     n, in_forms = len(problem.u.x.array), problem.bodies.F.constants()
-    held = np.array([bool(set_by_load({c: 0.0}, bcs, n).any()) for c in load])
+    rules = [rule.value for rule in rules_of(bcs)]
+    held = np.array([bool(set_by([c], bcs, n).any()) or holds(rules, c) for c in load])
     held = reduced(problem.comm, held, op=MPI.LOR)
     parts = [problem.equations, problem.couplings, problem.points, problem.dynamics, problem.materials, problem.declared]
     for i, (c, follows) in enumerate(zip(load, held)):

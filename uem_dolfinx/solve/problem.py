@@ -9,7 +9,8 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from uem_dolfinx import compat, given
+from uem_dolfinx import given
+from uem_dolfinx.conditions import prescribed
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact, parts_of
 from uem_dolfinx.contact.joining import join_alike
@@ -281,7 +282,7 @@ class UnitedProblem(given.Sealed):
         self.set_at = None if known else at
         if self.stage is not None:
             self.stage.take_load(at)
-        set_loads(self.comm, self.load, at)
+        set_loads(self.comm, self.load, at, self.bodies.bcs)
         for contact in self.contacts:
             contact.take_load(at, known)
         if self.linear is not None:
@@ -330,8 +331,7 @@ class UnitedProblem(given.Sealed):
         with agreed(self.comm):
             start = self.committed if start is None else given.vector("start", start, len(self.committed))
             fraction = given.number("fraction", fraction)
-        wanted = np.array(start)
-        compat.set_bc_values(wanted, self.bodies.bcs)
+        wanted = prescribed.values_at(start, self.bodies.bcs)
         checks.check_values(self, wanted)
         self.bodies.wanted[:] = self.bodies.of_owners(ramped(self.load, self.bodies.bcs, start, wanted, fraction))
         try:

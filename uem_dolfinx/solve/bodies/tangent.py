@@ -267,7 +267,7 @@ class Inversions:
         if forms.assemble_scalar(self._volume, config.comm) == 0.0:
             return None
         determinant = fem.Function(compat.function_space(config.mesh, ("DG", 0)))
-        compat.interpolate_expression(determinant, self._J)
+        forms.interpolation(determinant, self._J)()
         values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
         dofs = compat.cell_dofs(config.V)
         here = (np.inf, "")
