@@ -40,16 +40,17 @@ __all__ = [
     "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation",
     "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter",
     "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError",
-    "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "NotFiniteError", "OfTemperature", "OrientationError",
+    "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError",
     "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "PowerLaw", "PrecisionError", "Preload",
     "Resultant", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface",
     "Scheme", "SoftContact", "SpaceError", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError",
     "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
-    "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt", "animate", "axisymmetric", "consistent_mass", "dirichlet",
-    "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure", "function_space", "generalised_alpha", "gradient",
-    "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic",
-    "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent",
-    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric",
+    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure", "form",
+    "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
+    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
+    "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings",
+    "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -144,8 +145,9 @@ if _TYPE_CHECKING:
     from uem_dolfinx.output.surfaces import SurfaceWriter
     from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
     from uem_dolfinx.restart.state import State
-    from uem_dolfinx.scripting import dirichlet, ds, dx, integrate, interpolate
+    from uem_dolfinx.scripting import assemble_matrix, assemble_vector, dirichlet, ds, dx, form, integrate, interpolate
     from uem_dolfinx.solve.modes import Vibrations, modes
+    from uem_dolfinx.solve.settings import Newton
     from uem_dolfinx.solve.steps.step import Step
     from uem_dolfinx.solve.steps.time_step import TimeStep
     from uem_dolfinx.solve.steps.time_steps import time_steps
@@ -163,6 +165,7 @@ _LATER = {
     "Checkpoint": "restart.checkpoint", "read_checkpoint": "restart.checkpoint", "write_checkpoint": "restart.checkpoint",
     "State": "restart.state",
     "example_mesh": "geometry.gmsh", "read_gmsh": "geometry.gmsh",
+    "assemble_matrix": "scripting", "assemble_vector": "scripting", "form": "scripting",
     "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
     "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation",
@@ -178,6 +181,7 @@ _LATER = {
     "ContactParameter": "gradients.parameters",
     "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
     "History": "gradients.history", "recording": "gradients.history",
+    "Newton": "solve.settings",
     "Step": "solve.steps.step", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip
 

@@ -5,7 +5,7 @@ The time for this grows with the number of files: about 10 ms for each form with
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -33,6 +33,22 @@ def _meshes_kept(what: Any) -> Iterator[None]:
                 domain._ufl_coordinate_element = element
 
 
+#: Options of users for the compiler.
+_chosen: dict[str, Any] = {}
+
+
+@contextmanager
+def with_options(options: Mapping[str, Any]) -> Iterator[None]:
+    """Within this block forms are compiled with these options of DOLFINx's compiler calls."""
+    before = dict(_chosen)
+    _chosen.update(options)
+    try:
+        yield
+    finally:
+        _chosen.clear()
+        _chosen.update(before)
+
+
 @contextmanager
 def kept() -> Iterator[None]:
     """Within this block DOLFINx compiles, or searches its disk cache for, only forms that are new in this process.
@@ -45,6 +61,10 @@ def kept() -> Iterator[None]:
         if isinstance(what, tuple):
             # an expression at points
             return compile_anew(comm, what, *args, **options)
+        if _chosen:
+            # named so in DOLFINx 0.5, and in newer versions
+            name = next(one for one in ("jit_params", "jit_options") if one in options)
+            options[name] = {**(options[name] or {}), **_chosen}
         signature = what.signature() if isinstance(what, ufl.Form) else repr(what)
         key = signature, repr((args, sorted(options.items())))
         if not comm.allreduce(key in _known, op=MPI.LAND):

@@ -51,6 +51,17 @@ def check_linear(what: str, form: Any, V: Any) -> None:
         )
 
 
+def check_bilinear(what: str, form: Any, V: Any) -> None:
+    """Refuse anything but a form bilinear in a test and a trial function of a space, on its mesh; raises as ``check_linear``."""
+    arguments = _arguments(what, form, V.mesh, "not bilinear", "every term to hold the test and the trial function once")
+    if [argument.number() for argument in arguments] != [0, 1]:
+        raise InputError(
+            f"{what} has {len(arguments)} argument(s): expected a test and a trial function, as ufl.derivative(F, u) has"
+        )
+    if any(argument.ufl_function_space() != V for argument in arguments):
+        raise SpaceError(f"{what} has arguments of another space than the displacement: expected those of u.function_space")
+
+
 def check_functional(what: str, form: Any, domain: Any = None) -> None:
     """Refuse anything but a functional on a mesh (None: the mesh of its first integral); raises as ``check_linear``."""
     arguments = _arguments(what, form, domain, "no functional", "no test function, or every term to hold it")

@@ -420,3 +420,10 @@ def in_all_cells(F: ufl.Form, u: fem.Function, laws: bool = False) -> ufl.Form:
         return F
     nothing = fem.Constant(u.function_space.mesh, 0.0)
     return F + nothing * ufl.inner(u, F.arguments()[0]) * ufl.dx(u.function_space.mesh)
+
+
+def with_diagonal(J: ufl.Form, mixed: bool) -> ufl.Form:
+    """A bilinear form with a zero term in all cells, so that its sparsity includes every diagonal entry; a mixed one as it is."""
+    v, du = J.arguments()
+    domain = v.ufl_function_space().mesh
+    return J if mixed else fem.Constant(domain, 0.0) * ufl.inner(du, v) * ufl.dx(domain) + J

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from numbers import Number
 from typing import Any
 
@@ -12,6 +13,7 @@ from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from uem_dolfinx import compat, forms, given
+from uem_dolfinx.compiled import with_options
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.form_checks import check_functional, check_values
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -204,3 +206,82 @@ def integrate(integrals: ufl.Form | fem.Form) -> float:
         raise InputError("the form of no integrals belongs to no mesh: expected one integral at least")
     M = forms.form(revolved(integrals)) if isinstance(integrals, ufl.Form) else integrals
     return forms.assemble_scalar(M, forms.parts_of(M)[0].mesh.comm)
+
+
+def form(integrals: ufl.Form, jit_options: Mapping[str, Any] | None = None) -> Any:
+    """Compile a UFL form with any number of ``uem.ds(tag)`` and ``uem.dx(tag)`` (collective).
+
+        a = uem.form(ufl.inner(u, v) * ufl.dx + k * ufl.inner(u, v) * uem.ds(tags["left"]) + h * ufl.inner(u, v) * uem.ds(tags["top"]))
+
+    UFL alone refuses measures with several ``subdomain_data`` in one form.
+
+    Args:
+        integrals: in UFL, on a mesh declared ``axisymmetric`` over whole circles.
+        jit_options: for DOLFINx's compiler, e.g. ``{"cffi_extra_compile_args": ["-O3"]}``.
+
+    Returns:
+        DOLFINx's compiled form, for ``integrate``, ``assemble_vector``, ``assemble_matrix`` and DOLFINx. Integrals with one-point rules
+        beside others are compiled apart: a list of two forms, which DOLFINx's own functions do not take.
+
+    Raises:
+        InputError, InputTypeError: for anything else than a form of integrals.
+    """
+    given.kind(
+        "integrals", integrals, isinstance(integrals, ufl.Form), "a UFL form", "multiply an expression by ufl.dx or uem.ds(tag)"
+    )
+    if integrals.empty():
+        raise InputError("the form of no integrals belongs to no mesh: expected one integral at least")
+    with with_options(given.kind("jit_options", jit_options or {}, isinstance(jit_options, Mapping | None), "a dictionary")):
+        return forms.form(revolved(integrals))
+
+
+def assemble_vector(L: Any) -> PETSc.Vec:
+    """Vector of a linear form, in UFL or compiled by ``form``, summed over all ranks (collective).
+
+    Returns:
+        PETSc's ghosted vector; ``array`` has the values of this rank's unknowns, and ghosts are up to date.
+
+    Raises:
+        InputError, InputTypeError: for anything else, or a form of another number of arguments.
+    """
+    compiled = _of_rank("L", L, 1)
+    b = compat.create_vector(forms.parts_of(compiled)[0].function_spaces[0])
+    forms.assemble_vector(b, compiled)
+    b.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
+    return b
+
+
+def assemble_matrix(a: Any, bcs: Sequence[fem.DirichletBC] = ()) -> PETSc.Mat:
+    """Matrix of a bilinear form, in UFL or compiled by ``form`` (collective).
+
+    Args:
+        a: the form.
+        bcs: Dirichlet conditions, whose rows and columns are those of the identity.
+
+    Returns:
+        PETSc's assembled matrix.
+
+    Raises:
+        InputError, InputTypeError: for anything else, or a form of another number of arguments.
+    """
+    compiled = _of_rank("a", a, 2)
+    bcs = given.items("bcs", bcs, compat.is_dirichlet, "a Dirichlet condition")
+    A = forms.create_matrix(compiled)
+    forms.assemble_matrix(A, compiled)
+    if bcs:
+        found = [compat.bc_dofs(bc) for bc in bcs]
+        rows = np.unique(np.concatenate([dofs[:n] for dofs, n in found])).astype(np.int32)
+        first = A.getOwnershipRange()[0]
+        A.zeroRowsColumns(first + rows, diag=1.0)
+    return A
+
+
+def _of_rank(what: str, given_form: Any, rank: int) -> Any:
+    """A form of so many arguments, compiled."""
+    compiled = form(given_form) if isinstance(given_form, ufl.Form) else given_form
+    parts = forms.parts_of(compiled)
+    given.kind(what, given_form, all(hasattr(one, "function_spaces") for one in parts), "a UFL form, or one compiled by uem.form")
+    if any(len(one.function_spaces) != rank for one in parts):
+        words = {1: "linear in a test function", 2: "bilinear in a test and a trial function"}[rank]
+        raise InputError(f"{what} has {len(parts[0].function_spaces)} argument(s): expected a form {words}")
+    return compiled

@@ -108,14 +108,6 @@ def test_rigid_direction_without_length():
 # -- space -------------------------------------------------------------------------------------------------------------
 
 
-def test_scalar_displacement():
-    b = blocks(COMM, "triangle", 2, 2)
-    u = fem.Function(compat.function_space(b.scene.mesh, 1))
-    v = ufl.TestFunction(u.function_space)
-    F = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
-    raised(uem.SpaceError, "1 component.*vector Lagrange space of size 2", lambda: uem.UnitedProblem(F, u))
-
-
 def test_three_components_in_the_plane():
     b = blocks(COMM, "triangle", 2, 2)
     u = fem.Function(compat.function_space(b.scene.mesh, 1, (3,)))

@@ -24,24 +24,23 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
 
 
-def check_ties(gdim: int, contacts: Sequence[Any], equations: Sequence[Any], **others: Any) -> None:
+def check_ties(gdim: int, contacts: Sequence[Any], **others: Any) -> None:
     """Refuse contacts of a scalar field other than ties of two meshes, and options for displacements.
 
     Args:
         gdim: dimension of the mesh.
         contacts: of the problem.
-        equations: of the problem; without contacts and equations, the scalar field is considered a displacement of wrong size.
         others: other arguments by name; they must be None or empty.
 
     Raises:
         SpaceError, InputError: naming the first such argument.
     """
     others_than_ties = [one for one in contacts if getattr(one, "tied", False) is not True or hasattr(one.target, "project")]
-    if others_than_ties or not (contacts or equations):
-        which = f"contact '{others_than_ties[0].name}': " if others_than_ties else ""
+    if others_than_ties:
         raise SpaceError(
-            f"{which}the displacement has 1 component(s) in {gdim}D: use a vector Lagrange space of size {gdim}; a scalar u, as a "
-            "temperature, has ties of two meshes or linear equations: give Contact(..., tied=True) with facets of a mesh as its target"
+            f"contact '{others_than_ties[0].name}': the displacement has 1 component(s) in {gdim}D: use a vector Lagrange space of size "
+            f"{gdim}; the contacts of a scalar u, as a temperature, are ties of two meshes: give Contact(..., tied=True) with facets of "
+            "a mesh as its target"
         )
     for contact in contacts:
         if contact.heats:

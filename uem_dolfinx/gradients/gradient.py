@@ -182,6 +182,8 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             refuse_kept_projections(problem, problem.progress.steps)
         if not isinstance(problem.system, BodySystem) or not problem.system.consistent_tangent or problem.system.newton != "full":
             raise InputError("a gradient needs newton='full', consistent_tangent=True, and contact by elimination: the defaults")
+        if problem.bodies.tangent.given:
+            raise InputError("a gradient needs the derivative of F: expected J = None")
         if any(contact.heats for contact in problem.contacts):
             raise InputError("gradients do not support heat conducted through a contact: expected contacts without heat")
         if any(contact.normal is not None for contact in problem.contacts):

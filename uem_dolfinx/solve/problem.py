@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import ufl
 from dolfinx import fem
 
 from uem_dolfinx import given
+from uem_dolfinx.compiled import with_options
 from uem_dolfinx.conditions import prescribed
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact, parts_of
@@ -19,6 +20,7 @@ from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
 from uem_dolfinx.contact.warnings.checks import check_moved, check_new
 from uem_dolfinx.contact.warnings.watch import Watch
 from uem_dolfinx.errors import InputError, UEMError
+from uem_dolfinx.form_checks import check_bilinear
 from uem_dolfinx.forms import in_all_cells
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.rigid import Motion
@@ -45,8 +47,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.dynamics.inertia import Dynamics
     from uem_dolfinx.materials.elastic import HistoryMaterial
     from uem_dolfinx.restart.state import State
-
-ACCURACY = given.between(0.0, 1.0)
+    from uem_dolfinx.solve.settings import Newton
 
 
 class UnitedProblem(given.Sealed):
@@ -60,7 +61,7 @@ class UnitedProblem(given.Sealed):
         F: UFL residual, internal minus external virtual work; linear in a test function of the space of ``u``. Inertia and damping
             forces are added by ``dynamics``. On a mesh declared ``axisymmetric`` it is integrated over whole circles.
         u: displacement, a Function of a vector Lagrange space; holds the solution. With ``displacement`` a Function of a mixed
-            space. Or a scalar field: contacts are then ties of two meshes, and ``equations`` apply to the scalar.
+            space. Or a scalar field, such as a temperature or a phase field: contacts are then ties of two meshes.
         displacement: number of the displacement's part of the mixed space; other parts, such as a pressure or a temperature, are
             solved for as well, without contact conditions.
         bcs: Dirichlet conditions.
@@ -77,15 +78,13 @@ class UnitedProblem(given.Sealed):
             only. In time steps the factor is replaced by the time.
         dynamics: mass, velocity and time integration; None is statics.
         materials: all laws with history in F, such as ``VonMises``.
-        newton: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
-        consistent_tangent: add the curvature of the contact to K, which makes Newton quadratic.
-        line_search: shorten steps that invert cells or do not reduce the residual's work.
-        check_inversion: check for inverted cells in every iteration; None does so unless K is constant.
-        rtol: bound on the norm of ``P'r`` relative to the forces at work.
-        max_iterations: bound on the linear solves of one step.
+        newton: settings of Newton's method, ``uem.Newton(...)``; or one of its words, with the following six as its arguments.
+        consistent_tangent, line_search, check_inversion, rtol, max_iterations, verbose: see ``Newton``.
+        J: tangent in UFL, bilinear in a test and a trial function of the space of ``u``; by default the derivative of F by u. Laws with
+            history, damping and inertia add their own. It need not be exact, but gradients need the derivative.
+        jit_options: for the compiler of the forms of this problem, as in DOLFINx, e.g. ``{"cffi_extra_compile_args": ["-O3"]}``.
         method: method to impose contact, by default elimination: called with the arguments of ``solve.united.system.BodySystem``,
             it returns a ``solve.united.newton.ContactMethod``.
-        verbose: print one line per iteration.
 
     Raises:
         InputError, InputTypeError: for an argument of another type or out of its range, with its name and value; on all ranks.
@@ -117,7 +116,9 @@ class UnitedProblem(given.Sealed):
         load: fem.Constant | Mapping[fem.Constant, Any] | Callable[[float], None] | None = None,
         dynamics: Dynamics | None = None,
         materials: Sequence[HistoryMaterial] = (),
-        newton: str = "full",
+        J: ufl.Form | None = None,
+        jit_options: Mapping[str, Any] | None = None,
+        newton: Newton | Literal["full", "modified"] = "full",
         consistent_tangent: bool = True,
         line_search: bool = True,
         check_inversion: bool | None = None,
@@ -148,24 +149,29 @@ class UnitedProblem(given.Sealed):
                 from uem_dolfinx.contact.scalar_ties import ScalarTie, check_ties
 
                 others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
-                check_ties(self.config.gdim, contacts, equations, **others)
+                check_ties(self.config.gdim, contacts, **others)
             self.materials = checks.check_materials(materials, F, u, displacement)
             beside = {"materials": self.materials, "equations": equations, "couplings": couplings}
             self.dynamics = checks.check_dynamics(dynamics, contacts, beside, displacement is None and method is BodySystem)
-            newton = given.word("newton", newton, ("full", "modified"))
-            self.rtol, self.max_iterations = given.number("rtol", rtol, ACCURACY), given.count("max_iterations", max_iterations)
-            self.line_search, self.verbose = given.flag("line_search", line_search), given.flag("verbose", verbose)
+            if J is not None:
+                check_bilinear("J", J, u.function_space)
+            jit_options = given.kind("jit_options", jit_options or {}, isinstance(jit_options, Mapping | None), "a dictionary")
+            from uem_dolfinx.solve.settings import Settings, newton_of
+
+            loop = newton_of(
+                newton, consistent_tangent=consistent_tangent, line_search=line_search, check_inversion=check_inversion, rtol=rtol,
+                max_iterations=max_iterations, verbose=verbose,
+            )  # fmt: skip
+            self.rtol, self.max_iterations = loop.rtol, loop.max_iterations
+            self.line_search, self.verbose = loop.line_search, loop.verbose
             given.kind("method", method, callable(method), "what makes a united system of bodies and contacts, as BodySystem")
             if method is not BodySystem and any(contact.heats or contact.normal for contact in contacts):
                 raise InputError("heat and soft contact need the default method: leave method out, or heat and normal")
-            consistent_tangent = given.flag("consistent_tangent", consistent_tangent)
-            check_inversion = None if check_inversion is None else given.flag("check_inversion", check_inversion)
         given.alike(
             self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in contacts], materials=len(self.materials),
             equations=[type(one).__name__ for one in equations], points=[type(one).__name__ for one in points],
             couplings=[one.name for one in couplings],
-            newton=newton, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search,
-            consistent_tangent=consistent_tangent, check_inversion=check_inversion,
+            J=J is None, jit_options=jit_options, newton=loop,
         )  # fmt: skip
         #: Contacts as declared, and, below, their parts: a general contact consists of several.
         ties, contacts = ([], contacts) if self.config.moves else (contacts, [])
@@ -183,15 +189,11 @@ class UnitedProblem(given.Sealed):
 
             at_points = AtPoints(self.config, points, couplings)
         #: The bodies without contact.
-        self.bodies = Bodies(
-            self.config,
-            F if damping is None else F + damping,
-            bcs,
-            materials=self.materials,
-            dynamics=dynamics,
-            points=at_points,
-            check_inversion=check_inversion,
-        )
+        with with_options(jit_options):
+            self.bodies = Bodies(
+                self.config, F if damping is None else F + damping, bcs, materials=self.materials, dynamics=dynamics, points=at_points,
+                check_inversion=loop.check_inversion, J=J if J is None or damping is None else J + ufl.derivative(damping, u),
+            )  # fmt: skip
         for one in couplings:
             one.attach(self.config, not self.bodies.tangent.linear)
         if couplings:
@@ -213,7 +215,7 @@ class UnitedProblem(given.Sealed):
             dynamics.make_contactors_massless(self.contacts)
             warn_of_soft_targets(dynamics.mass, self.contacts, self.bodies.initial_stiffness)
         #: Options of the system that the Newton loop solves.
-        options: dict[str, Any] = {"newton": newton, "consistent_tangent": consistent_tangent}
+        options: dict[str, Any] = {"newton": loop.method, "consistent_tangent": loop.consistent_tangent}
         #: Equations of users, or None.
         self.linear: UserRows | None = None
         scalar = [ScalarTie(self.config, tie, free) for tie in ties] if ties else []
@@ -246,8 +248,6 @@ class UnitedProblem(given.Sealed):
             contact.begin()
         #: Warnings issued during steps.
         self.watch = Watch(self.contacts)
-        from uem_dolfinx.solve.settings import Settings
-
         #: Settings of the run, for checkpoints.
         declared = {"equations": equations, "couplings": couplings, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in declared.items() if some}
@@ -437,14 +437,3 @@ class UnitedProblem(given.Sealed):
     def rigid_motions(self) -> list[Motion | None]:
         """Present motions of the rigid targets of all ``interfaces``; None for targets that have not moved, and for meshes."""
         return [pair.target.motion for pair in self.interfaces]
-
-
-def check_steps(problem: Any, checkpoint: Any) -> None:
-    """Refuse arguments of step functions that are no problem or no checkpoint (collective if there is a problem).
-
-    Raises:
-        InputTypeError: for other objects.
-    """
-    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
-    with agreed(problem.comm):
-        checks.check_checkpoint(checkpoint)

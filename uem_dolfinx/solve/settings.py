@@ -1,4 +1,4 @@
-"""Settings of a run in words, for its checkpoint: a run restarted with other settings would differ from both runs.
+"""Settings of Newton's method, and of a run in words, for its checkpoint: a run restarted with others would differ from both.
 
 Values of Constants and Functions are taken when the problem is made, since loads change later. They have six digits, which do not depend
 on the partition.
@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from hashlib import blake2b
 from inspect import signature
-from typing import Any
+from typing import Any, Literal
 
 from mpi4py import MPI
 
@@ -26,6 +27,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import as_law, follows_load, parameters
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.dynamics.scheme import newmark
+from uem_dolfinx.errors import InputError
 from uem_dolfinx.given import described
 from uem_dolfinx.restart.numbering import DIGEST
 
@@ -160,3 +162,61 @@ def _extent(values: Any) -> Array:
     """Smallest and largest value on this rank."""
     array = np.asarray(values, dtype=float)
     return np.array([array.min(initial=np.inf), array.max(initial=-np.inf)])
+
+
+#: Bounds of a relative tolerance.
+ACCURACY = given.between(0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Newton:
+    """Settings of Newton's method, ``UnitedProblem(..., newton=uem.Newton(rtol=1e-10, max_iterations=30))``.
+
+    Args:
+        method: ``"full"`` or ``"modified"`` (the tangent of the step's first iteration is kept).
+        consistent_tangent: add the curvature of the contact to K, which makes Newton quadratic.
+        line_search: shorten steps that invert cells or do not reduce the residual's work.
+        check_inversion: check for inverted cells in every iteration; None does so unless K is constant.
+        rtol: bound on the norm of ``P'r`` relative to the forces at work.
+        max_iterations: bound on the linear solves of one step.
+        verbose: print one line per iteration.
+
+    Raises:
+        InputError, InputTypeError: for a value of another type or out of its range.
+    """
+
+    method: Literal["full", "modified"] = "full"
+    consistent_tangent: bool = True
+    line_search: bool = True
+    check_inversion: bool | None = None
+    rtol: float = 1e-8
+    max_iterations: int = 50
+    verbose: bool = False
+
+    def __post_init__(self) -> None:
+        def take(what: str, value: Any) -> None:
+            object.__setattr__(self, what, value)
+
+        given.word("method", self.method, ("full", "modified"))
+        for what in ("consistent_tangent", "line_search", "verbose"):
+            take(what, given.flag(what, getattr(self, what)))
+        if self.check_inversion is not None:
+            take("check_inversion", given.flag("check_inversion", self.check_inversion))
+        take("rtol", given.number("rtol", self.rtol, ACCURACY))
+        take("max_iterations", given.count("max_iterations", self.max_iterations))
+
+
+def newton_of(newton: Any, **others: Any) -> Newton:
+    """The settings of a problem: a ``Newton``, or a word and the others one by one.
+
+    Raises:
+        InputError: for other arguments beside a ``Newton``.
+        InputTypeError, InputError: see ``Newton``.
+    """
+    if not isinstance(newton, Newton):
+        given.word("newton", newton, ("full", "modified"))
+        return Newton(method=newton, **others)
+    defaults = {one.name: one.default for one in fields(Newton)}
+    if beside := [name for name, value in others.items() if value is not defaults[name] and value != defaults[name]]:
+        raise InputError(f"{beside[0]} is given beside newton, a Newton: expected it there, uem.Newton({beside[0]}=...)")
+    return newton

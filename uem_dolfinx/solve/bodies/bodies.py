@@ -57,8 +57,10 @@ class Bodies:
         dynamics: inertia, or None in statics.
         points: loads and springs at nodes, or None.
         check_inversion: whether to look for cells turned inside out; None does so unless K is constant.
+        J: tangent of users in place of the derivative of F, or None.
 
     Attributes:
+        F: the residual.
         unknowns: rows of vectors and matrices; the nodes, unless there are other fields.
         held: unknowns with a Dirichlet condition, ghosts included ``(n,)``.
         free: components of the displacement without Dirichlet condition ``(n_local, gdim)``.
@@ -80,13 +82,13 @@ class Bodies:
         dynamics: Dynamics | None = None,
         points: AtPoints | None = None,
         check_inversion: bool | None = None,
+        J: ufl.Form | None = None,
     ):
         self.config, self.comm, self.u = config, config.comm, config.whole
         self.unknowns = config.unknowns
         self.materials, self.dynamics, self.points = list(materials), dynamics, points
-        #: The residual in UFL.
         self.F = F
-        self.tangent = Tangent(F, config, self.materials, dynamics, points)
+        self.tangent = Tangent(F, config, self.materials, dynamics, points, J)
         with compiling("the residual"):
             self._F = forms.form(F)
         self._b = compat.create_vector(self.u.function_space)
@@ -287,8 +289,7 @@ class Bodies:
         Raises:
             InputError: for a component that has a condition on a rank that does not own it, but not on its owner.
         """
-        self.bcs = list(bcs)
-        own = np.zeros(len(self.u.x.array), dtype=bool)
+        self.bcs, own = list(bcs), np.zeros(len(self.u.x.array), dtype=bool)
         for bc in self.bcs:
             own[compat.bc_dofs(bc)[0]] = True
         self.held: Bools = self.of_owners(own)

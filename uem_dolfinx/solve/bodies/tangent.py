@@ -41,6 +41,7 @@ class Tangent:
         materials: laws with stresses that are no expressions of u; they add their stiffness.
         dynamics: inertia, which adds a multiple of M, or None.
         points: loads and springs at nodes, or None.
+        J: bilinear form in place of the derivative of F, or None.
 
     Raises:
         SpaceError: if F does not depend on u.
@@ -53,9 +54,13 @@ class Tangent:
         materials: Sequence[HistoryMaterial] = (),
         dynamics: Dynamics | None = None,
         points: AtPoints | None = None,
+        J: ufl.Form | None = None,
     ):
         u = config.whole
-        J = ufl.derivative(F, u)
+        #: Whether the tangent is a form of the user, and may differ from the derivative.
+        self.given = J is not None
+        derivative = ufl.derivative(F, u)
+        J = derivative if J is None else forms.with_diagonal(revolved(J), config.unknowns.mixed)
         for material in materials:
             J += revolved(material.stiffness(ufl.TrialFunction(u.function_space), F.arguments()[0]))
         J, self._inputs = forms.with_derivatives(J)
@@ -63,6 +68,8 @@ class Tangent:
             raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
         #: Whether K is the same for every u.
         self.linear: bool = not any(f is u for f in self._inputs)
+        if self.given:
+            self.linear = self.linear and not any(f is u for f in forms.with_derivatives(derivative)[1])
         self._dynamics, self._factor, self._points = dynamics, 0.0, points
         self._values: list[Array] | None = None
         with compiling("the tangent"):

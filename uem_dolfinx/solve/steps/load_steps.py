@@ -14,9 +14,10 @@ from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.memory import take_back
-from uem_dolfinx.solve.problem import UnitedProblem, check_steps
+from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
+from uem_dolfinx.solve.steps.arguments import check_steps
 from uem_dolfinx.solve.steps.limit_points import LimitPoint
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.united.newton import Iteration
