@@ -171,7 +171,7 @@ class UnitedProblem(given.Sealed):
             self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in contacts], materials=len(self.materials),
             equations=[type(one).__name__ for one in equations], points=[type(one).__name__ for one in points],
             couplings=[one.name for one in couplings],
-            J=J is None, jit_options=jit_options, newton=loop,
+            J=J is None, jit_options=jit_options, newton=loop.method, **{k: v for k, v in vars(loop).items() if k != "method"},
         )  # fmt: skip
         #: Contacts as declared, and, below, their parts: a general contact consists of several.
         ties, contacts = ([], contacts) if self.config.moves else (contacts, [])
