@@ -42,15 +42,15 @@ __all__ = [
     "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError",
     "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError",
     "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "PowerLaw", "PrecisionError", "Preload",
-    "Resultant", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface",
-    "Scheme", "SoftContact", "SpaceError", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError",
-    "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
-    "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric",
-    "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure", "form",
-    "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
-    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
-    "read_gmsh", "read_mesh", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings",
-    "write_checkpoint",
+    "Resultant", "Results", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere",
+    "RigidSurface", "Scheme", "SoftContact", "SpaceError", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck",
+    "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError",
+    "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector",
+    "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure",
+    "form", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
+    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene",
+    "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent", "taylor_test",
+    "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -137,10 +137,12 @@ if _TYPE_CHECKING:
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
     from uem_dolfinx.materials.hardening import Voce
     from uem_dolfinx.materials.von_mises import VonMises
+    from uem_dolfinx.output.curves import plot_energies, plot_history
     from uem_dolfinx.output.energy import Energies, EnergyBook
     from uem_dolfinx.output.films import animate
     from uem_dolfinx.output.frames import outline
     from uem_dolfinx.output.pictures import figure, plot_pressure, plot_scene, plot_setup
+    from uem_dolfinx.output.reading import Results, read_results
     from uem_dolfinx.output.results import HistoryWriter, ResultsWriter
     from uem_dolfinx.output.surfaces import SurfaceWriter
     from uem_dolfinx.restart.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -173,6 +175,7 @@ _LATER = {
     "Preload": "contact.preload",
     "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening", "VonMises": "materials.von_mises",
     "HistoryWriter": "output.results", "ResultsWriter": "output.results",
+    "plot_energies": "output.curves", "plot_history": "output.curves", "Results": "output.reading", "read_results": "output.reading",
     "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "plot_setup": "output.pictures",

@@ -76,3 +76,24 @@ def test_surfaces_that_cannot_be_written(folder):
     b = helpers.blocks(COMM, "triangle")
     alone = uem.UnitedProblem(helpers.linear(b.u, 1.0), b.u, bcs=b.oedometer(0.1))
     helpers.refused(uem.InputError, "no contacts", lambda: uem.SurfaceWriter(folder / "run", alone))
+
+
+def test_fields_of_friction(folder):
+    """Status, traction and slip at the nodes of the surface."""
+    pyvista = pytest.importorskip("pyvista")
+    b = helpers.blocks(COMM, "triangle")
+    bcs = [uem.dirichlet(b.V, b.bottom), uem.dirichlet(b.V, b.top, 1, -0.05), uem.dirichlet(b.V, b.top, 0, 0.2)]
+    contact = uem.Contact(b.high, b.low, friction=0.1)
+    problem = uem.UnitedProblem(helpers.linear(b.u, 1.0), b.u, bcs=bcs, contacts=[contact])
+    with uem.SurfaceWriter(folder / "run", problem) as writer:
+        for step in uem.load_steps(problem, 4):
+            writer.write(step)
+    if COMM.rank == 0:
+        grids = [pyvista.read(name) for name in sorted((folder / "run_surfaces").glob("00004_*.vtu"))]
+        assert grids
+        for grid in grids:
+            found = grid.point_data
+            slips = found["status"] == 2.0
+            assert slips.any() and found["slip"].shape[1] == found["traction"].shape[1] == 3
+            size = np.linalg.norm(found["traction"], axis=1)[slips]
+            np.testing.assert_allclose(size, 0.1 * found["pressure"][slips], rtol=1e-8)

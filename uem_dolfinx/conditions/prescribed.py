@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from mpi4py import MPI
@@ -12,7 +12,7 @@ import numpy as np
 from dolfinx import fem
 from ufl.core.expr import Expr
 
-from uem_dolfinx import compat, forms, given
+from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.parallel import agreed, ask_together
@@ -92,18 +92,3 @@ def _n_arguments(words: str, value: Callable[..., Any]) -> int:
         expected = "a function of places x (3, n), or of x and the load factor or time"
         raise InputTypeError(given.sentence(words, value, expected)) from None
     return 2
-
-
-def rules_of(bcs: Sequence[Any]) -> list[Rule]:
-    """The rules of Dirichlet conditions that have one."""
-    return [bc.rule for bc in bcs if hasattr(bc, "rule")]
-
-
-def values_at(x: Array, bcs: Sequence[Any]) -> Array:
-    """A local array with its Dirichlet values, those by UFL expressions at their present values (collective)."""
-    for rule in rules_of(bcs):
-        if isinstance(rule.value, Expr):
-            rule.interpolate()
-    found = np.array(x)
-    compat.set_bc_values(found, bcs)
-    return found

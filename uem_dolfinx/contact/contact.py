@@ -356,7 +356,7 @@ class Contact(WatchedContact, given.Sealed):
         if self.adjust and self.tied is not True:
             self._offsets_of_pair().adjust(self.adjust)
         self._set_offset()
-        if self._wears:
+        if self.wears:
             from uem_dolfinx.contact.friction.wear import Wear
 
             assert friction is not None
@@ -389,7 +389,8 @@ class Contact(WatchedContact, given.Sealed):
         return own(config, nodes, target, chords=self.chords and config.degree == 2, contactor=self.contactor, **how), None
 
     @property
-    def _wears(self) -> bool:
+    def wears(self) -> bool:
+        """Whether the contactor wears."""
         return callable(self._wear) or self._wear > 0.0
 
     def _sliding_of(
@@ -398,7 +399,7 @@ class Contact(WatchedContact, given.Sealed):
         """Friction of the interface, or None; with wear also for frictionless contact, to accumulate slip (collective)."""
         law = as_law(self.friction)
         value = self._friction_at(law, nodes, self._at)
-        if value is None and not self._wears:
+        if value is None and not self.wears:
             return None
         from uem_dolfinx.contact.friction.limits import Limits
         from uem_dolfinx.contact.friction.sliding import Sliding

@@ -16,7 +16,6 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.conditions.prescribed import rules_of
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
@@ -26,7 +25,7 @@ from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
-from uem_dolfinx.solve.loading import holds, set_by
+from uem_dolfinx.solve.loading import holds, rules_of, set_by
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.system import BodySystem
 

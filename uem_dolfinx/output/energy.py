@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -198,21 +199,29 @@ class EnergyBook(Closing, given.Sealed):
         """Plot the energies over time in a panel of :func:`uem_dolfinx.figure`; nothing for None, as on ranks other than 0."""
         if panel is None:
             return
-        t = [row.time for row in self.rows]
-        kept = ("kinetic", "stored", "dissipated", "damped")
-        total = [sum(getattr(row, name) for name in kept) - row.external for row in self.rows]
-        for name in (*kept, "external", "contact", "friction"):
-            values = [getattr(row, name) for row in self.rows]
-            # negligible quantities are not plotted
-            if max(map(abs, values)) > 1e-6 * max(map(abs, total)):
-                panel.plot(t, values, label=name, ls="--" if name in ("external", "contact", "friction") else "-")
-        panel.plot(t, total, "k", lw=1.2, label="sum less external work")
-        panel.set_xlabel("time")
-        panel.set_ylabel("energy")
-        panel.grid(alpha=0.25)
-        panel.legend(frameon=False, ncol=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+        draw_energies(panel, self.columns())
+
+    def columns(self) -> dict[str, Array]:
+        """Energies and works of all rows by name ``(n_rows,)``."""
+        return {one.name: np.array([getattr(row, one.name) for row in self.rows]) for one in fields(Energies)}
 
     def close(self) -> None:
         """Close the file."""
         if self.table is not None:
             self.table.close()
+
+
+def draw_energies(panel: Any, columns: Mapping[str, Array]) -> None:
+    """Draw energies and works by name ``(n,)`` over time in a panel, except negligible ones."""
+    kept = ("kinetic", "stored", "dissipated", "damped")
+    total = sum(columns[name] for name in kept) - columns["external"]
+    for name in (*kept, "external", "contact", "friction"):
+        if np.abs(columns[name]).max(initial=0.0) > 1e-6 * np.abs(total).max(initial=0.0):
+            panel.plot(
+                columns["time"], columns[name], label=name, ls="--" if name in ("external", "contact", "friction") else "-"
+            )
+    panel.plot(columns["time"], total, "k", lw=1.2, label="sum less external work")
+    panel.set_xlabel("time")
+    panel.set_ylabel("energy")
+    panel.grid(alpha=0.25)
+    panel.legend(frameon=False, ncol=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))

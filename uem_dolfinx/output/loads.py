@@ -11,9 +11,8 @@ from dolfinx import fem
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.conditions.prescribed import rules_of
 from uem_dolfinx.geometry.rigid import RigidSurface
-from uem_dolfinx.solve.loading import set_loads
+from uem_dolfinx.solve.loading import rules_of, set_loads
 from uem_dolfinx.solve.problem import UnitedProblem
 
 

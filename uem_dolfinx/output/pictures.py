@@ -105,7 +105,7 @@ def figure(
 
 
 @contextmanager
-def _panel(
+def panel_of(
     picture: str | Path | BinaryIO | Any, comm: MPI.Comm, size: tuple[float, float] = (6.4, 4.8), dpi: float = 150
 ) -> Iterator[Any]:
     """A given panel, or the panel of a new picture of this name; errors in drawing are raised on all ranks (collective)."""
@@ -177,7 +177,7 @@ def plot_scene(
         cmap=cmap, view=view, surface=surface, percentiles=percentiles, rigid=rigid, triad=triad,
     )  # fmt: skip
     frame, file = drawing.take(), BytesIO()
-    with _panel(file if picture is ... else picture, problem.comm, size, dpi) as panel:
+    with panel_of(file if picture is ... else picture, problem.comm, size, dpi) as panel:
         if panel is not None and frame is not None:
             # margins are cut off
             drawing.width = max(drawing.width, round(2.0 * panel.get_window_extent().width))
@@ -254,7 +254,7 @@ def plot_setup(
     if gdim == 3:
         pictures3d.require(problem.comm)
     found, file = Declarations(problem, at, loads).found, BytesIO()
-    with _panel(file if picture is ... else picture, problem.comm, size, dpi) as panel:
+    with panel_of(file if picture is ... else picture, problem.comm, size, dpi) as panel:
         if panel is not None and found is not None:
             width = max(1600, round(2.0 * panel.get_window_extent().width))
             (draw_2d if gdim == 2 else draw_3d)(panel, found, Look(more, cells, box, toward, legend, triad, width))
@@ -304,7 +304,7 @@ def plot_pressure(
         shown = checked_window(1, window)
     found = [gather_contactors(contact, 0.0) for contact in pairs]
     file = BytesIO()
-    with _panel(file if picture is ... else picture, pairs[0].config.comm) as ax:
+    with panel_of(file if picture is ... else picture, pairs[0].config.comm) as ax:
         if ax is not None:
             gdim = pairs[0].config.gdim
             along = along or ((lambda x: x[:, 0]) if gdim == 2 else (lambda x: np.hypot(x[:, 0], x[:, 1])))

@@ -26,6 +26,8 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.time_step import TimeStep
 
+#: Names of contact fields in the files of a ``ResultsWriter``, where they differ.
+CALLED = {"pressure": "contact_pressure", "force": "contact_force"}
 #: Endings of VTX files, by the rank of the tensors in them.
 ENDINGS = ("scalars", "vectors")
 
@@ -149,7 +151,8 @@ class ResultsWriter(Closing, given.Sealed):
 
     Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv`` and ``PATH_pairs.csv`` as in ``HistoryWriter``, and, if DOLFINx
     has ADIOS2, ``PATH_vectors.bp`` and ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, e.g. ``field_1``; for
-    every contact its pressure, gap, status, force and heat flux; and ``fields``. XDMF has nodal values at the nodes of the mesh only,
+    every contact its pressure, gap, active contactors and force, with friction also status, traction and slip, further wear and heat
+    flux; and ``fields``. XDMF has nodal values at the nodes of the mesh only,
     so that a displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
 
     After every step XDMF and CSV are complete. Existing results are never overwritten: they are moved to the folder ``PATH.1``, or the
@@ -279,10 +282,7 @@ class ResultsWriter(Closing, given.Sealed):
         """Functions of the problem by name, up to date (collective)."""
         found = self.problem.config.functions()
         for contact, suffix in zip(self.problem.declared, contact_suffixes(self.problem.declared)):
-            found |= {f"contact_pressure{suffix}": contact.pressure, f"gap{suffix}": contact.gap}
-            found |= {f"active{suffix}": contact.active, f"contact_force{suffix}": contact.force}
-            for k, field in enumerate(dict.fromkeys(law.field for law in contact.heats)):
-                found[f"heat_flux{f'_of_field_{field}' if k else ''}{suffix}"] = contact.heat_flux_of(field)
+            found |= {f"{CALLED.get(name, name)}{suffix}": u for name, u in contact_fields(contact).items()}
         return found
 
     def write(self, step: LoadStep | TimeStep | float) -> None:
@@ -361,6 +361,22 @@ def clock(step: LoadStep | TimeStep | float) -> float:
     known = isinstance(step, (TimeStep, LoadStep, int, float, np.number))
     given.kind("step", step, known, "a step of load_steps or time_steps, or its factor or time")
     return float(step.time if isinstance(step, TimeStep | LoadStep) else step)
+
+
+def contact_fields(contact: Contact | GeneralContact) -> dict[str, fem.Function]:
+    """Fields on the contactors of a contact by name, those of friction, ties, wear and heat only where there are any (collective)."""
+    parts = contact.parts if isinstance(contact, GeneralContact) else [contact]
+    found = {name: getattr(contact, name) for name in ("pressure", "gap", "active", "force")}
+    rubs = any(part.pair.friction is not None for part in parts)
+    if rubs or any(part.tied for part in parts):
+        found |= {name: getattr(contact, name) for name in ("status", "traction")}
+    if rubs:
+        found["slip"] = contact.slip
+    if isinstance(contact, Contact) and contact.wears:
+        found["wear"] = contact.wear
+    for k, field in enumerate(dict.fromkeys(law.field for law in contact.heats)):
+        found[f"heat_flux{f'_of_field_{field}' if k else ''}"] = contact.heat_flux_of(field)
+    return found
 
 
 def contact_suffixes(contacts: Sequence[Contact | GeneralContact]) -> list[str]:

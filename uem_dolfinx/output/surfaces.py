@@ -14,7 +14,7 @@ from uem_dolfinx.files import given_path, keep_aside, on_rank_0
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
-from uem_dolfinx.output.results import clock, contact_suffixes, refuse_others
+from uem_dolfinx.output.results import clock, contact_fields, contact_suffixes, refuse_others
 from uem_dolfinx.output.tables import Closing
 from uem_dolfinx.parallel import agree, agreed
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -31,7 +31,8 @@ class SurfaceWriter(Closing, given.Sealed):
     """Time series of the contactors' surfaces only, so that pressures are visible from all sides.
 
     Writes ``PATH.pvd``, complete after every step, which lists the files ``PATH_surfaces/STEP_CONTACT_RANK.vtu`` that every rank writes of
-    its own facets, if it has any: displacement, pressure, gap, status and force of the contact at the deformed nodes.
+    its own facets, if it has any: displacement, and the fields of the contact as in ``ResultsWriter``, at the
+    deformed nodes.
     Existing files are moved to a folder as in ``ResultsWriter``::
 
         with uem.SurfaceWriter("out/run", problem) as writer:
@@ -106,8 +107,9 @@ class SurfaceWriter(Closing, given.Sealed):
     def _fields(self, contact: Any) -> dict[str, Array]:
         """Values at local nodes by name (collective)."""
         config = self.problem.config
-        found = {name: getattr(contact, name).x.array for name in ("pressure", "gap", "active")}
-        return found | {"force": contact.force.x.array.reshape(-1, config.gdim), "displacement": config.displacement}
+        fields = contact_fields(contact)
+        found = {name: u.x.array.reshape(-1, *u.ufl_shape) for name, u in fields.items()}
+        return found | {"displacement": config.displacement}
 
     def _write(self, path: Path, surface: TargetFacets, fields: dict[str, Array]) -> None:
         """This rank's facets of one surface, if there are any (collective)."""

@@ -99,7 +99,7 @@ class XdmfSeries:
             for u in functions:
                 V = u.function_space
                 if id(V) not in known:
-                    known[id(V)] = _numbering(V)
+                    known[id(V)] = numbering_of(V)
                 self._fields.append((u, centre, self._field(u, known[id(V)])))
         self._cells, self._nodes = self._mesh_tables(S)
         #: Number of steps in the files.
@@ -141,7 +141,7 @@ class XdmfSeries:
 
     def _mesh_tables(self, S: Any) -> tuple[Table, Table]:
         """Nodes of every cell in VTK's order, and coordinates of the nodes."""
-        numbering, place = _numbering(S), fem.Function(S)
+        numbering, place = numbering_of(S), fem.Function(S)
         owned, gdim = len(numbering.place), self._mesh.geometry.dim
         place.x.array[:owned] = numbering.place
         place.x.scatter_forward()
@@ -312,7 +312,7 @@ def _cell_keys(mesh: Any) -> tuple[int, AnyArray]:
     return n, np.arange(*cells.local_range, dtype=np.int64)
 
 
-def _numbering(V: Any) -> Numbering:
+def numbering_of(V: Any) -> Numbering:
     """Order of a space's nodes in the files: the input order if the mesh has it (collective)."""
     mesh = V.mesh
     cells = mesh.topology.index_map(mesh.topology.dim)

@@ -21,7 +21,6 @@ from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.conditions.prescribed import rules_of
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
@@ -103,6 +102,21 @@ def _fitting(constant: fem.Constant, value: Any) -> Any:
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(given.sentence("the value of a Constant in load", value, words))
     return array
+
+
+def rules_of(bcs: Sequence[Any]) -> list[Any]:
+    """The ``conditions.prescribed.Rule`` of Dirichlet conditions that have one."""
+    return [bc.rule for bc in bcs if hasattr(bc, "rule")]
+
+
+def values_at(x: Array, bcs: Sequence[Any]) -> Array:
+    """A local array with its Dirichlet values, those by UFL expressions at their present values (collective)."""
+    for rule in rules_of(bcs):
+        if isinstance(rule.value, Expr):
+            rule.interpolate()
+    found = np.array(x)
+    compat.set_bc_values(found, bcs)
+    return found
 
 
 def bring_load(problem: Any, at: float) -> None:

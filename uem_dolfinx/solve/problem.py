@@ -11,7 +11,6 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.compiled import with_options
-from uem_dolfinx.conditions import prescribed
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact, parts_of
 from uem_dolfinx.contact.joining import join_alike
@@ -31,7 +30,7 @@ from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.norms import Norm
-from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads
+from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads, values_at
 from uem_dolfinx.solve.reactions import reactions
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress
@@ -331,7 +330,7 @@ class UnitedProblem(given.Sealed):
         with agreed(self.comm):
             start = self.committed if start is None else given.vector("start", start, len(self.committed))
             fraction = given.number("fraction", fraction)
-        wanted = prescribed.values_at(start, self.bodies.bcs)
+        wanted = values_at(start, self.bodies.bcs)
         checks.check_values(self, wanted)
         self.bodies.wanted[:] = self.bodies.of_owners(ramped(self.load, self.bodies.bcs, start, wanted, fraction))
         try:

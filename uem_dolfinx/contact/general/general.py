@@ -303,7 +303,7 @@ class GeneralContact(OfProblem, given.Sealed):
     @property
     def pressure(self) -> fem.Function:
         """Contact pressure as a scalar field on contactors, summed over all touched bodies (collective)."""
-        return self._sum("pressure")
+        return self._of_all("pressure")
 
     def pressure_to_integrate(self) -> fem.Function:
         """Normal forces per reference area; the integral over surfaces in contact is their sum; see ``Contact`` (collective).
@@ -316,12 +316,27 @@ class GeneralContact(OfProblem, given.Sealed):
     @property
     def force(self) -> fem.Function:
         """Nodal contact forces as a vector field, on both bodies (collective)."""
-        return self._sum("force")
+        return self._of_all("force")
+
+    @property
+    def traction(self) -> fem.Function:
+        """Tangential force per area, as a vector field on contactors, summed over all touched bodies (collective)."""
+        return self._of_all("traction")
+
+    @property
+    def slip(self) -> fem.Function:
+        """Accumulated slip as a vector field on contactors, summed over all touched bodies, a length (collective)."""
+        return self._of_all("slip")
+
+    @property
+    def status(self) -> fem.Function:
+        """0 at open contactors, 1 if they stick to all that they touch, 2 if they slip; see ``Contact.status`` (collective)."""
+        return self._of_all("status", np.maximum)
 
     @property
     def active(self) -> fem.Function:
         """The number of bodies and rigid surfaces that contactors touch, as a scalar field (collective)."""
-        return self._sum("active")
+        return self._of_all("active")
 
     @property
     def heat_flux(self) -> fem.Function:
@@ -329,7 +344,7 @@ class GeneralContact(OfProblem, given.Sealed):
 
         With several conductances, it belongs to the field of the first one.
         """
-        return self.heat_flux_of(self.heats[0].field) if self.heats else self._sum("heat_flux")
+        return self.heat_flux_of(self.heats[0].field) if self.heats else self._of_all("heat_flux")
 
     def heat_flux_of(self, field: int) -> fem.Function:
         """The heat flux of a given field; see ``Contact.heat_flux_of`` (collective)."""
@@ -359,10 +374,7 @@ class GeneralContact(OfProblem, given.Sealed):
         total = sum((r.force for r in rigid), nothing.force), sum((r.moment for r in rigid), nothing.moment)
         return Resultant(*total, sum(r.normal for r in rigid))
 
-    def _sum(self, what: str) -> fem.Function:
-        return self._of_all(what, np.add)
-
-    def _of_all(self, what: str, together: np.ufunc) -> fem.Function:
+    def _of_all(self, what: str, together: np.ufunc = np.add) -> fem.Function:
         """A field combined over all parts (collective)."""
         return self._together(what, [getattr(part, what) for part in self.parts], together)
 

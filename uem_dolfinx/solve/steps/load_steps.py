@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,11 +13,11 @@ from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
+from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.memory import take_back
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import REMAINDER, StepControl
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
-from uem_dolfinx.solve.steps.arguments import check_steps
 from uem_dolfinx.solve.steps.limit_points import LimitPoint
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.united.newton import Iteration
@@ -174,3 +174,14 @@ def _next_factor(done: float, control: StepControl) -> float:
     if goal - factor < REMAINDER * nominal:
         factor = goal
     return 1.0 if 1.0 - factor < REMAINDER else float(factor)
+
+
+def check_steps(problem: Any, checkpoint: Any) -> None:
+    """Refuse arguments of step functions that are no problem or no checkpoint (collective if there is a problem).
+
+    Raises:
+        InputTypeError: for other objects.
+    """
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    with agreed(problem.comm):
+        checks.check_checkpoint(checkpoint)
