@@ -10,6 +10,7 @@ Options:
     kind: a quarter in 3D, or half of the section of a body of revolution
     rho_inf: part of the fastest motions that a time step keeps, 0 to 1
     contactors: contactors with their mass, or without
+    scheme: implicit steps, or explicit ones, with a foot without mass
 """
 
 # %% [markdown]
@@ -25,7 +26,7 @@ Options:
 # Dirichlet conditions the foot stays flat. Here contactors keep their mass, as they do in the codes compared, and the touch itself
 # gives some energy to the rod; with `--contactors massless` it does not, steps are cut at first, and the rim comes out 8 % too wide.
 # The time integration damps motions that the steps do not resolve. A quarter is modelled with hexahedra, or half of the section with
-# quadrilaterals by `--kind axisymmetric`.
+# quadrilaterals by `--kind axisymmetric`. Explicit steps, `--scheme explicit`, are central differences without damping; their foot has no mass.
 
 # %%
 import common
@@ -45,6 +46,7 @@ args = common.arguments(
     rho_inf=0.3,
     kind=("3d", "axisymmetric"),
     contactors=("massy", "massless"),
+    scheme=("implicit", "explicit"),
     coupling=("node_to_surface", "mortar"),
 )
 # N, mm, tonnes, s
@@ -80,11 +82,12 @@ def impact(wall: str) -> tuple[dict[str, float], np.ndarray, uem.EnergyBook]:
         contacts = [uem.Contact(foot, uem.RigidPlane(0 * upwards, upwards), coupling=args.coupling)]
     else:
         bcs.append(uem.dirichlet(V, foot, gdim - 1))
+    explicit = args.scheme == "explicit"
     dynamics = uem.Dynamics(
-        uem.consistent_mass(V, rho),
+        (uem.lumped_mass if explicit else uem.consistent_mass)(V, rho),
         velocity=-speed * upwards,
-        scheme=uem.generalised_alpha(args.rho_inf),
-        contactors=args.contactors,
+        scheme=uem.CentralDifferences() if explicit else uem.generalised_alpha(args.rho_inf),
+        contactors="massless" if explicit else args.contactors,
     )
     problem = uem.UnitedProblem(
         copper.residual(v), u, bcs=bcs, contacts=contacts, materials=[copper], dynamics=dynamics,
@@ -93,11 +96,12 @@ def impact(wall: str) -> tuple[dict[str, float], np.ndarray, uem.EnergyBook]:
     fields = {"peeq": copper.cell_averages()["peeq"]}
     writer = uem.ResultsWriter(f"{args.output}/rod_{wall}", problem, fields=fields) if args.output else None
     book = uem.EnergyBook(problem, path=f"{args.output}/rod_{wall}_energy.csv" if args.output else None)
-    steps, iterations = 0, 0
-    for step in uem.time_steps(problem, args.dt * 1e-6, args.end * 1e-6):
+    steps, iterations, every = 0, 0, 20 if explicit else 1
+    for step in uem.time_steps(problem, None if explicit else args.dt * 1e-6, args.end * 1e-6):
         steps, iterations = steps + 1, iterations + step.newton_iterations
-        book.write(step)
-        if writer is not None:
+        if steps % every == 0:
+            book.write(step)
+        if writer is not None and steps % every == 0:
             copper.cell_averages()
             writer.write(step)
     for opened in (book, writer):
@@ -165,6 +169,6 @@ if args.plot:
 
 # %%
 if args.end >= 80.0:
-    assert results["length_error"] < 0.01 and results["foot_error"] < (0.05 if args.contactors == "massy" else 0.1), results
+    assert results["length_error"] < 0.01 and results["foot_error"] < (0.05 if args.contactors == "massy" and args.scheme == "implicit" else 0.1), results
     assert held["length_error"] < 0.01 and held["foot_error"] < 0.05, results
 assert all(abs(row["energy_defect"]) < 0.05 for row in results["walls"]), results

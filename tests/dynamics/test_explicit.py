@@ -201,7 +201,7 @@ def test_steps_that_end(left, steps):
 
 
 def test_steps_that_shrink():
-    """A bar that is squeezed has shorter cells: after fifty steps they are shorter, too."""
+    """A bar that is squeezed has shorter cells, and shorter steps each time that its cells are shorter by a tenth."""
     bar = Flight(2, 90, law=uem.NeoHooke)
     y = bar.problem.config.X[:, 1]
     bar.dynamics.velocity.x.array.reshape(-1, 2)[:, 1] = 1.5 * (5.5 - y)
@@ -210,7 +210,8 @@ def test_steps_that_shrink():
         lengths.append(step.dt)
         if step.number == 51:
             break
-    assert np.ptp(lengths[:50]) == 0.0 and lengths[50] < 0.95 * lengths[0]
+    changed = np.flatnonzero(np.diff(lengths))
+    assert 2 <= len(changed) <= 5 and lengths[50] < 0.95 * lengths[0]
 
 
 def test_a_step_takes_one_residual(monkeypatch):
@@ -293,7 +294,6 @@ REFUSED = {
     "a consistent mass": ({"consistent": True}, "lumped mass"),
     "contactors with mass": ({"dynamics": {"contactors": "massy"}}, "contactors='massy'"),
     "damping": ({"dynamics": {"damping": lambda rate: ufl.inner(rate, rate) * ufl.dx}}, "damping does not go"),
-    "a history": ({"history": True}, "materials does not go"),
     "a tie": ({"contact": {"tied": True}}, "is tied"),
     "a general contact": ({"general": True}, "GeneralContact"),
     "events": ({"steps": {"event_tolerance": 0.1}}, "event_tolerance"),
@@ -309,18 +309,13 @@ def test_what_does_not_go_is_refused(what):
                                       box("quadrilateral", [0.0, 10.0], [1.0, 20.0], [1, 12])])  # fmt: skip
     V = compat.function_space(s.mesh, 1, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)
-    law = (
-        uem.VonMises(u, 900.0, 0.0, 1.0, kind="plane_stress")
-        if "history" in how
-        else uem.LinearElastic(900.0, 0.0, kind="plane_stress")
-    )
-    form = law.residual(v) if "history" in how else law.residual(u, v) * ufl.dx
+    form = uem.LinearElastic(900.0, 0.0, kind="plane_stress").residual(u, v) * ufl.dx
     mass = (uem.consistent_mass if "consistent" in how else uem.lumped_mass)(V, 1.0)
     contact = uem.Contact(s.tag("up", 1, at(1, 10.0)), s.tag("low", 0, at(1, 10.0)), **how.get("contact", {}))
     contact = uem.GeneralContact() if "general" in how else contact
     with pytest.raises(uem.InputError, match=words):
         problem = uem.UnitedProblem(
-            form, u, contacts=[contact], materials=[law] if "history" in how else [],
+            form, u, contacts=[contact],
             dynamics=uem.Dynamics(mass, scheme=uem.CentralDifferences(), **how.get("dynamics", {})),
         )  # fmt: skip
         for _ in uem.time_steps(problem, end=0.1, **how.get("steps", {})):

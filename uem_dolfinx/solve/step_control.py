@@ -39,11 +39,12 @@ class StepControl:
         number: number of completed steps.
         largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
         largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
+        due: number of the step after which explicit steps find the critical step anew.
     """
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
-        self._cuts, self._read, self._longest_before = 0, False, np.inf
+        self._cuts, self._read, self._longest_before, self.due = 0, False, np.inf, 0
 
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
@@ -92,13 +93,13 @@ class StepControl:
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers for a checkpoint, by name."""
         kept = {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
-        return kept | {"nominal length": self.nominal, "largest speed": self.largest_speed}
+        return kept | {"nominal length": self.nominal, "largest speed": self.largest_speed, "critical step due": self.due}
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
-        # files of earlier versions have no speed
-        kept = {"largest speed": 0.0} | kept
-        self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed = (
+        # files of earlier versions lack these
+        kept = {"largest speed": 0.0, "critical step due": 0} | kept
+        self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due = (
             kept[name] for name in self.to_checkpoint()
         )
         self._read, self._longest_before = True, self.longest

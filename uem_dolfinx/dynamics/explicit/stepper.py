@@ -8,18 +8,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx import forms
+from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.explicit.critical import highest_eigenvalue
 from uem_dolfinx.dynamics.explicit.surface import SurfaceSolver
 from uem_dolfinx.errors import MassError
+from uem_dolfinx.parallel import reduced
 
 #: A surface at rest makes the square of the highest frequency much larger if by more than this factor: contacts then change the step.
 #: [convention; square of the highest frequency; test_explicit.py::test_stiff_contactors_do_not_shorten_steps]
 STIFF_SURFACE = 1.25
+#: The critical step is found anew after so many steps at most, since bodies may yield or turn.
+#: [convention; steps; test_explicit_materials.py::test_cells_that_are_flattened]
+CHECKED_EVERY = 50
+#: It is found anew before the velocities stretch a cell by more than this part.
+#: [convention; strain; test_explicit_materials.py::test_cells_that_are_flattened]
+CHECKED_STRAIN = 0.1
 #: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from.
 #: [format; wave numbers; -]
 IRRATIONAL = 1e3 * np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
@@ -96,6 +105,8 @@ class ExplicitStepper:
         frequency higher, that bound is taken, which no contact exceeds; otherwise ``of_contact`` is set, as contacts change the step.
         """
         problem = self.problem
+        # committed stresses are on the yield surface, from where the tangent is elastic, as it is in unloading
+        problem.bodies.restore()
         problem.bodies.update_tangent()
         fixed = self._highest(self._stiffness_if_fixed)
         with problem.bodies.holding(self.interior):
@@ -107,6 +118,17 @@ class ExplicitStepper:
         self.of_contact = fixed > STIFF_SURFACE * condensed
         highest = condensed if self.of_contact else fixed
         return 2.0 / np.sqrt(highest) if highest > 0.0 else np.inf
+
+    def steps_to_check(self, dt: float) -> int:
+        """Number of steps of length ``dt`` after which the critical step is found anew (collective)."""
+        config = self.problem.config
+        n_vertices = len(forms.reference_topology(compat.cell_name(config.mesh))[0])
+        v, vertices = self.dynamics.velocity.x.array.reshape(-1, config.gdim), compat.cell_dofs(config.V)[:, :n_vertices]
+        one, other = vertices[:, np.array(np.triu_indices(n_vertices, 1))].transpose(1, 0, 2)
+        speed, length = (np.linalg.norm(of[one] - of[other], axis=2) for of in (v, config.x))
+        rate = float((speed / length).max(initial=0.0))
+        strain = dt * reduced(self.problem.comm, rate, op=MPI.MAX)
+        return int(np.clip(CHECKED_STRAIN / strain, 1, CHECKED_EVERY)) if strain > 0.0 else CHECKED_EVERY
 
     def _highest(self, apply: Callable[[Array], Array]) -> float:
         config, mass = self.problem.config, self._mass * self.moving

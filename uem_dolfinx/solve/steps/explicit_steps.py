@@ -14,9 +14,6 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import gathered
 from uem_dolfinx.solve.steps.time_step import TimeStep, events, touching
 
-#: Bodies that yield or turn have another critical step after so many steps.
-#: [convention; steps; test_explicit.py::test_steps_that_shrink]
-CHECKED_EVERY = 50
 #: What is left to the end is rounding below this part of a step.
 #: [convention; length of a step; test_explicit.py::test_steps_that_end]
 LEFT = 1e-6
@@ -39,25 +36,34 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     if not dynamics.accelerated:
         stepper.begin()
     length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), _pattern(problem)
+    control.begin(length)
+    if not resumed:
+        # bodies that touch deform from the first step on
+        control.due = control.number + 1
     while (remainder := end - dynamics.time) > LEFT * length:
-        taken = length if remainder >= (1.0 - LEFT) * length else remainder
+        taken = min(length if remainder >= (1.0 - LEFT) * length else remainder, control.longest)
         try:
             problem.set_load(dynamics.time + taken)
             iterations = stepper.step(taken)
-        except UEMError:
+        except UEMError as error:
             dynamics.restore()
             problem.set_load(dynamics.time)
             problem.restore()
+            stepper.surface.kept = False
+            if control.shorten(taken, error):
+                continue
             raise
-        control.begin(length)
         number, cuts = control.done(iterations)
         after = touching(problem)
         last = pattern
         yield TimeStep(number, dynamics.time, taken, iterations, cuts, *events(problem, before, after))
+        # bodies that meet deform from now on
+        due = not problem.bodies.linear and (number >= control.due or after != before)
         before = after
-        due = not problem.bodies.linear and number % CHECKED_EVERY == 0
         if due or (stepper.of_contact and (pattern := _pattern(problem)) != last):
             length = _length(stepper, dt, end)
+            control.due = number + stepper.steps_to_check(length)
+            control.begin(length)
 
 
 def _pattern(problem: Any) -> tuple[int, ...]:

@@ -1,0 +1,101 @@
+"""Central differences for bodies that yield: the plastic wave in closed form, steps that follow flattened cells, restart."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import at, box, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
+from uem_dolfinx.parallel import reduced
+
+COMM = MPI.COMM_WORLD
+E, NU, Y, H, LENGTH = 900.0, 0.3, 2.0, 60.0, 10.0
+G = E / (2 * (1 + NU))
+BULK = E / (3 * (1 - 2 * NU))
+#: Moduli of uniaxial strain, elastic and plastic, and the stress at which it yields.
+ELASTIC, PLASTIC, FIRST = BULK + 4 * G / 3, BULK + 4 * G * H / (3 * (3 * G + H)), Y * (BULK + 4 * G / 3) / (2 * G)
+
+
+class Bar:
+    """A bar of density 1 that cannot expand laterally and flies with ``speed`` onto a wall; laws and kinds as in ``uem``."""
+
+    def __init__(self, law=uem.VonMises, cells=100, speed=0.4, coupling="node_to_surface"):
+        s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, LENGTH], [1, cells])])
+        V = compat.function_space(s.mesh, 1, (2,))
+        u, v = fem.Function(V), ufl.TestFunction(V)
+        material = law(u, E, NU, Y, H, kind="plane_strain")
+        bcs = [uem.dirichlet(V, s.tag("sides", 0, lambda x: (x[:, 0] < 1e-9) | (x[:, 0] > 1 - 1e-9)), 0)]
+        self.contact = uem.Contact(
+            s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane(np.zeros(2), np.array([0.0, 1.0])), coupling=coupling
+        )
+        self.dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=(0.0, -speed), scheme=uem.CentralDifferences())
+        self.problem = uem.UnitedProblem(
+            material.residual(v), u, bcs=bcs, contacts=[self.contact], materials=[material], dynamics=self.dynamics
+        )
+        self.u, self.speed = u, speed
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("law", [uem.VonMises, uem.FinitePlasticity])
+def test_the_plastic_wave(law, coupling):
+    """The wall feels the stress of both waves, ``s_Y + rho c_p (v - v_Y)``; what has flowed is dissipated."""
+    speed = 0.4 if law is uem.VonMises else 0.2
+    bar, rows = Bar(law, 60 if coupling == "mortar" else 100, speed, coupling), []
+    book = uem.EnergyBook(bar.problem)
+    for step in uem.time_steps(bar.problem, end=0.4):
+        row = book.write(step)
+        rows.append((step.time, bar.contact.resultant().force[1], row.defect / book.rows[0].kinetic))
+    t, force, defect = np.array(rows).T
+    v_first = FIRST / np.sqrt(ELASTIC)
+    assert speed > 1.9 * v_first
+    exact = FIRST + np.sqrt(PLASTIC) * (speed - v_first)
+    plateau = force[(t > 0.15) & (t < 0.39)]
+    assert abs(plateau.mean() / exact - 1) < 0.02
+    # without flow the force would be that of elastic waves
+    assert exact < 0.95 * np.sqrt(ELASTIC) * speed
+    assert book.rows[-1].dissipated > 0.05 * book.rows[0].kinetic and np.abs(defect).max() < 0.02
+
+
+def test_cells_that_are_flattened():
+    """The critical step is found anew before cells are flattened by a tenth; cells at rest have as many steps as there may be."""
+    bar = Bar(speed=0.0)
+    stepper = ExplicitStepper(bar.problem)
+    assert stepper.steps_to_check(1e-3) == 50
+    bar.dynamics.velocity.x.array.reshape(-1, 2)[:, 1] = -7.0 * bar.problem.config.X[:, 1]
+    assert stepper.steps_to_check(1e-3) == 14
+    assert stepper.steps_to_check(1.0) == 1
+
+
+def test_yielded_bars_have_the_critical_step_of_unloading():
+    """Points that flow are soft until they unload: the critical step is that of elastic points."""
+    bar = Bar()
+    elastic = ExplicitStepper(bar.problem).critical_step()
+    for step in uem.time_steps(bar.problem, end=0.15):
+        pass
+    assert bar.problem.materials[0].peeq.x.array.max(initial=0.0) > 0 or COMM.size > 1
+    assert abs(ExplicitStepper(bar.problem).critical_step() / elastic - 1) < 1e-2
+
+
+def test_restart(tmp_path):
+    """A run that goes on from a checkpoint is the uninterrupted one to rounding, with the same steps."""
+    path = COMM.bcast(str(tmp_path / "kept"))
+    whole, first, second = (Bar(uem.FinitePlasticity, 40, 3.0) for _ in range(3))
+    lengths = [step.dt for step in uem.time_steps(whole.problem, end=0.2)]
+    steps = uem.time_steps(first.problem, end=0.2, checkpoint=uem.Checkpoint(path, every=7))
+    for step in steps:
+        if step.number == 24:
+            break
+    steps.close()
+    again = uem.time_steps(second.problem, end=0.2, checkpoint=uem.Checkpoint(path, every=7))
+    later = [step.dt for step in again]
+    assert len(set(lengths)) > 1
+    assert later == lengths[-len(later):] and 0 < len(later) < len(lengths)
+    own = np.abs(second.u.x.array - whole.u.x.array).max(initial=0.0)
+    assert reduced(COMM, float(own), op=MPI.MAX) < 1e-12
