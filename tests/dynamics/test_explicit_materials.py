@@ -96,6 +96,6 @@ def test_restart(tmp_path):
     again = uem.time_steps(second.problem, end=0.2, checkpoint=uem.Checkpoint(path, every=7))
     later = [step.dt for step in again]
     assert len(set(lengths)) > 1
-    assert later == lengths[-len(later):] and 0 < len(later) < len(lengths)
+    assert later == lengths[-len(later) :] and 0 < len(later) < len(lengths)
     own = np.abs(second.u.x.array - whole.u.x.array).max(initial=0.0)
     assert reduced(COMM, float(own), op=MPI.MAX) < 1e-12
