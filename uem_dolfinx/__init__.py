@@ -36,21 +36,21 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 __version__ = "0.2.0"
 
 __all__ = [
-    "Adaptation", "Balance", "CentralDifferences", "Checkpoint", "CheckpointError", "Conductance", "ConflictError", "Contact",
-    "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation",
-    "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError", "GeneralContact", "History", "HistoryWriter",
-    "InputError", "InputTypeError", "InvertedElementError", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError",
-    "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError",
-    "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "PowerLaw", "PrecisionError", "Preload",
-    "Resultant", "Results", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere",
-    "RigidSurface", "Scheme", "SoftContact", "SpaceError", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck",
-    "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError",
-    "UnitedProblem", "UserFunctionError", "Vibrations", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector",
-    "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure",
-    "form", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
-    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene",
-    "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent", "taylor_test",
-    "time_steps", "timing", "timings", "write_checkpoint",
+    "Adaptation", "Balance", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive", "Conductance",
+    "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook",
+    "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError",
+    "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic",
+    "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton",
+    "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad",
+    "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results", "ResultsWriter", "RigidCoupling",
+    "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SoftContact", "SpaceError",
+    "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags",
+    "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce",
+    "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet",
+    "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure", "form", "function_space", "generalised_alpha",
+    "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline",
+    "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh",
+    "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -118,8 +118,10 @@ if _TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+    from uem_dolfinx.contact.laws.cohesive import Cohesive
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.exponential import Exponential
+    from uem_dolfinx.contact.laws.mixed_mode import BenzeggaghKenane, Power
     from uem_dolfinx.contact.laws.power_law import PowerLaw
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.laws.stribeck import Stribeck
@@ -158,6 +160,7 @@ if _TYPE_CHECKING:
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "SoftContact": "contact.laws.soft",
     "Exponential": "contact.laws.exponential", "PowerLaw": "contact.laws.power_law",
+    "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.mixed_mode", "Power": "contact.laws.mixed_mode",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
     "CentralDifferences": "dynamics.explicit.central_differences",
     "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",

@@ -17,7 +17,9 @@ from uem_dolfinx.contact.laws.law import (
     Field,
     FrictionLaw,
     as_law,
+    check_tied,
     follows_load,
+    given_cohesion,
     given_field,
     given_friction,
     given_normal,
@@ -27,6 +29,7 @@ from uem_dolfinx.contact.laws.law import (
 )
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.kinds import kind_of_interface, tie_of
 from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics
 from uem_dolfinx.contact.warnings.checks import warn_of_slim_tips, warn_of_straight_facets
 from uem_dolfinx.contact.warnings.watch import WatchedContact
@@ -42,6 +45,7 @@ from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.laws.cohesive import Cohesive
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
@@ -93,6 +97,8 @@ class Contact(WatchedContact, given.Sealed):
             initial gap of each contactor becomes part of its offset; :attr:`adjusted` is the largest. Tied contactors keep their
             gap, and ``adjust`` is the reach of the tie, by default True.
         normal: None is hard contact; a ``SoftContact`` makes the pressure a function of the gap, without friction, wear, heat and tie.
+        cohesion: a ``Cohesive`` bonds the contactors that ``adjust`` reaches, as a tie, until they separate. Its results are
+            :attr:`damage`, and :attr:`pressure` and :attr:`traction` with the bonds. Friction acts on the damaged part.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -103,6 +109,7 @@ class Contact(WatchedContact, given.Sealed):
     """
 
     SETTABLE = dict.fromkeys(("friction", "offset"))
+    cohesion: Cohesive | None = None
     #: Whether it is part of a general contact.
     of_all_surfaces = False
 
@@ -124,6 +131,7 @@ class Contact(WatchedContact, given.Sealed):
         wear: Field = 0.0,
         heat: Conductance | Sequence[Conductance] | None = None,
         normal: SoftContact | None = None,
+        cohesion: Cohesive | None = None,
         measure: str = "reference",
         name: str | None = None,
     ):
@@ -148,14 +156,8 @@ class Contact(WatchedContact, given.Sealed):
             if not isinstance(adjust, (bool, np.bool_)):
                 adjust = given.number("adjust", adjust, REACH)
             self._offset = given_field("offset", offset)
-            if tied is True and offset != 0.0:
-                raise InputError(
-                    "offset does not go with tied = True, which keeps the gaps that there are: leave one of them out"
-                )
-            if tied is True and wear != 0.0:
-                raise InputError("wear does not go with tied = True, which never slips: leave it out, or take tied = 'after'")
-            if tied is True and as_law(friction).field != 0.0:
-                raise InputError("friction does not go with tied = True, which never slips: leave it out, or take tied = 'after'")
+            check_tied(tied, offset, wear, friction)
+            self.cohesion = given_cohesion(cohesion, sliding, normal, friction, wear, self.heats, tied)
             if coupling == "mortar" and (chords or normals != "facet"):
                 what = "chords = True" if chords else f"normals = '{normals}'"
                 raise InputError(
@@ -305,7 +307,8 @@ class Contact(WatchedContact, given.Sealed):
     def words(self) -> dict[str, str]:
         """Settings of tie and normal contact, which must be equal when a checkpoint is resumed."""
         words = {"tied and adjust": f"{self.tied}, {self.adjust}"} if self.tied or self.adjust else {}
-        return words | ({"normal": repr(self.normal)} if self.normal else {})
+        laws = {"normal": self.normal, "cohesion": self.cohesion}
+        return words | {name: repr(law) for name, law in laws.items() if law is not None}
 
     def attach(
         self, config: Configuration, free: Bools, *, at: float = 0.0, duration: Callable[[], float] | None = None
@@ -334,7 +337,8 @@ class Contact(WatchedContact, given.Sealed):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear, normal=repr(self.normal), heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
+            wear=self._wear, normal=repr(self.normal), cohesion=repr(self.cohesion),
+            heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
@@ -343,14 +347,9 @@ class Contact(WatchedContact, given.Sealed):
         of["max_penetration"] = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
-        tie = self._tie(nodes, discretisation, means, **of) if self.tied else None
-        kind: Callable[..., Interface] = Interface
-        if self.normal is not None:
-            from uem_dolfinx.contact.pair.soft import interface_of
-
-            kind = interface_of(self.normal, self)
+        tie, kind = self._tie(nodes, discretisation, means, **of), kind_of_interface(self)
         self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
-        if self.tied is True:
+        if self.tied is True or self.cohesion is not None:
             self._pair.project()
             self._pair.unite()
         if self.adjust and self.tied is not True:
@@ -378,7 +377,7 @@ class Contact(WatchedContact, given.Sealed):
 
             surface = TargetFacets(config, self.contactor, "contactor")
             warn_of_slim_tips(config, self.name, surface)
-            tied = self.tied and target.n_nodes
+            tied = (self.tied or self.cohesion is not None) and target.n_nodes
             means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"})) if tied else None
             return Mortar(config, nodes, target, surface=surface, **how), means
         from uem_dolfinx.contact.nodes.bernstein import Bernstein
@@ -415,13 +414,9 @@ class Contact(WatchedContact, given.Sealed):
             value_now=self._friction_now,
         )  # fmt: skip
 
-    def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Tie:
-        """Permanent tie of contactors; ``means`` as in ``Tie``."""
-        from uem_dolfinx.contact.ties.tie import Tie
-
-        return Tie(
-            self.config, nodes, discretisation, means=means, reach=None if isinstance(self.adjust, bool) else self.adjust, **of
-        )
+    def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Tie | None:
+        """Permanent tie or bonds, see ``tie_of``."""
+        return tie_of(self, nodes, discretisation, means, **of)
 
     def tie(self) -> None:
         """Tie active contactors permanently at their present position, from the next step on; others remain in contact.

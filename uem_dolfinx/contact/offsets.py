@@ -26,20 +26,21 @@ class Offsets:
 
     Attributes:
         pair: the present interface.
+        declared: offsets of the user ``(n,)``.
         adjusted: initial heights of contactors that are treated as touching ``(n,)``.
         worn: wear depths ``(n,)``.
     """
 
     def __init__(self, pair: Interface, name: str):
         self.pair, self._name = pair, name
-        self._given: Array = np.zeros(len(pair.nodes))
+        self.declared: Array = np.zeros(len(pair.nodes))
         self.adjusted: Array = np.zeros(len(pair.nodes))
         self.worn: Array = np.zeros(len(pair.nodes))
 
     def set(self, offset: Field) -> None:
         """Set an offset, in addition to adjusted and worn lengths; contactors must be placed again (collective)."""
         config, nodes, words = self.pair.config, self.pair.nodes, f"contact '{self._name}': offset"
-        self._given = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
+        self.declared = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
         self._hand_over()
 
     def wear(self, worn: Array) -> None:
@@ -48,7 +49,7 @@ class Offsets:
         self._hand_over()
 
     def _hand_over(self) -> None:
-        total = self._given + self.adjusted - self.worn
+        total = self.declared + self.adjusted - self.worn
         some = reduced(self.pair.config.comm, bool(total.any()), op=MPI.LOR)
         self.pair.set_offset(total if some else None)
 

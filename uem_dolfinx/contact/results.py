@@ -284,6 +284,12 @@ class ContactResults:
         return self._field("wear", 0.0 if friction is None else friction.worn)
 
     @property
+    def damage(self) -> fem.Function:
+        """Damage of the cohesion that acts, 0 where it is intact, 1 where surfaces are separated, as a scalar field (collective)."""
+        state = self.pair.trial.cohesion
+        return self._field("damage", 0.0 if state is None else state[:, 1])
+
+    @property
     def worn_volume(self) -> float:
         """Worn volume of the contactor after all committed steps: integral of ``wear`` over the reference surface (collective)."""
         wear = None if self.pair.friction is None else self.pair.friction.wear

@@ -33,7 +33,8 @@ def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) 
     """
     facets = config.tdim - 1
     single = [one for one in contacts if not one.of_all_surfaces and one.tied is not True and one.contactor.dim == facets]
-    conducts = np.array([one.normal is not None or any(callable(law.h) for law in one.heats) for one in single], dtype=bool)
+    laws = [one.normal is not None or one.cohesion is not None for one in single]
+    conducts = np.array([law or any(callable(heat.h) for heat in one.heats) for law, one in zip(laws, single)], dtype=bool)
     slides = np.array([one.pair.friction is not None for one in single], dtype=bool)
     if len(single) < 2 or not (conducts | slides).any():
         return

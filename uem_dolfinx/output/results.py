@@ -151,8 +151,8 @@ class ResultsWriter(Closing, given.Sealed):
 
     Writes ``PATH.xdmf`` with its numbers in ``PATH.bin``, ``PATH.csv`` and ``PATH_pairs.csv`` as in ``HistoryWriter``, and, if DOLFINx
     has ADIOS2, ``PATH_vectors.bp`` and ``PATH_scalars.bp``. Fields: displacement; other parts of a mixed space, e.g. ``field_1``; for
-    every contact its pressure, gap, active contactors and force, with friction also status, traction and slip, further wear and heat
-    flux; and ``fields``. XDMF has nodal values at the nodes of the mesh only,
+    every contact its pressure, gap, active contactors and force, with friction also status, traction and slip, further damage, wear
+    and heat flux; and ``fields``. XDMF has nodal values at the nodes of the mesh only,
     so that a displacement of degree 2 is interpolated. VTX has the fields of the displacement's degree.
 
     After every step XDMF and CSV are complete. Existing results are never overwritten: they are moved to the folder ``PATH.1``, or the
@@ -364,16 +364,18 @@ def clock(step: LoadStep | TimeStep | float) -> float:
 
 
 def contact_fields(contact: Contact | GeneralContact) -> dict[str, fem.Function]:
-    """Fields on the contactors of a contact by name, those of friction, ties, wear and heat only where there are any (collective)."""
+    """Fields on the contactors of a contact by name, of friction, ties, bonds, wear and heat only where there are any (collective)."""
     parts = contact.parts if isinstance(contact, GeneralContact) else [contact]
     found = {name: getattr(contact, name) for name in ("pressure", "gap", "active", "force")}
     rubs = any(part.pair.friction is not None for part in parts)
-    if rubs or any(part.tied for part in parts):
+    if rubs or any(part.pair.tie is not None for part in parts):
         found |= {name: getattr(contact, name) for name in ("status", "traction")}
     if rubs:
         found["slip"] = contact.slip
     if isinstance(contact, Contact) and contact.wears:
         found["wear"] = contact.wear
+    if isinstance(contact, Contact) and contact.cohesion is not None:
+        found["damage"] = contact.damage
     for k, field in enumerate(dict.fromkeys(law.field for law in contact.heats)):
         found[f"heat_flux{f'_of_field_{field}' if k else ''}"] = contact.heat_flux_of(field)
     return found

@@ -97,7 +97,7 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         with timed("united matrix"):
             added = added_mass(system.linear, like)
             # stiffness of soft contacts
-            gaps, _ = slip_terms([pair for pair in pairs if pair.trial.law_gap is not None], like)
+            gaps, _ = slip_terms([pair for pair in pairs if pair.trial.has_law], like)
             stiffness = together(bodies.tangent.K, together(curvature, gaps))
             A, B = _united(P, stiffness), _united(P, together(M, added))
     return _solve(slepc, problem, P, A, B, n)

@@ -118,6 +118,46 @@ def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], ti
     return normal
 
 
+def given_cohesion(cohesion: Any, sliding: str, normal: Any, friction: Any, wear: Any, heats: Sequence[Any], tied: Any) -> Any:
+    """Checked user input for the cohesion of a contact: a ``Cohesive``, or None.
+
+    Raises:
+        InputTypeError: for another type.
+        InputError: for cohesion with a soft contact, friction by temperature, wear, heat or a tie; for plastic unloading with
+            ``sliding = "finite"``, as permanent openings do not turn with the bodies.
+    """
+    given.kind("cohesion", cohesion, cohesion is None or hasattr(cohesion, "respond"), "a Cohesive, or None")
+    hot = isinstance(as_law(friction).field, OfTemperature)
+    others = (
+        ("normal", normal),
+        ("friction by temperature", hot),
+        ("wear", callable(wear) or wear),
+        ("heat", heats),
+        ("tied", tied),
+    )
+    for what, there in others:
+        if cohesion is not None and there:
+            raise InputError(f"{what} does not go with cohesion: leave it out")
+    if getattr(cohesion, "unloading", None) == "plastic" and sliding == "finite":
+        raise InputError("unloading = 'plastic' does not go with sliding = 'finite': take 'small' or 'fixed'")
+    return cohesion
+
+
+def check_tied(tied: Any, offset: Any, wear: Any, friction: Any) -> None:
+    """Refuse what does not go with ``tied = True``.
+
+    Raises:
+        InputError: for an offset, wear or friction.
+    """
+    if tied is not True:
+        return
+    if offset != 0.0:
+        raise InputError("offset does not go with tied = True, which keeps the gaps that there are: leave one of them out")
+    for what, there in (("wear", wear != 0.0), ("friction", as_law(friction).field != 0.0)):
+        if there:
+            raise InputError(f"{what} does not go with tied = True, which never slips: leave it out, or take tied = 'after'")
+
+
 def given_field(what: str, value: Any, within: given.Range = given.FINITE) -> Field:
     """Checked user input: a number of a range or a function of position."""
     return cast(Field, value) if callable(value) else given.number(what, value, within)

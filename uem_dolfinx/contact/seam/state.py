@@ -88,6 +88,8 @@ class PairState:
             conductances.
         law_gap: gaps at which the law of a soft contact gives the forces, infinity for the present gaps ``(n,)``; None for hard contact,
             and while it is switched off.
+        cohesion: damage, delayed damage, load factor or time of these, permanent opening and normal of bonds ``(n, 3 + 2 gdim)``; None
+            without cohesion.
     """
 
     active: Bools
@@ -105,6 +107,12 @@ class PairState:
     bond: Array | None = None
     heat: Array | None = None
     law_gap: Array | None = None
+    cohesion: Array | None = None
+
+    @property
+    def has_law(self) -> bool:
+        """Whether forces follow a law of gaps or openings."""
+        return self.law_gap is not None or self.cohesion is not None
 
     @property
     def in_corner(self) -> Bools:
@@ -135,7 +143,7 @@ class PairState:
             keys_of: function from facet numbers to keys independent of the partition ``(k,)``.
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
-        for name in ("bond", "heat", "law_gap"):
+        for name in ("bond", "heat", "law_gap", "cohesion"):
             if getattr(self, name) is None:
                 del kept[name]
         if self.heat is not None and self.heat.shape[1] == 1:

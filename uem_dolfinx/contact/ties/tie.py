@@ -97,7 +97,7 @@ class Tie:
         self._make(self._within_reach(state) if which is None else which, off)
         assert self.rows is not None
         error = None
-        if not reduced(self.config.comm, int(self.tied.sum())):
+        if not reduced(self.config.comm, int(self.rows.has.sum())):
             what = "is near enough to the target" if which is None else "touches the target"
             error = SurfaceError(
                 f"{self.name}: no contactor {what} to be tied to it: bring the surfaces together, or give a larger adjust"

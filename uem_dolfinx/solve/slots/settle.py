@@ -78,7 +78,7 @@ class _Slots:
         """Whether two laws, of a gap and of a slip, describe all contactors of this rank."""
         friction, cornered = self.pair.friction, bool(self.pair.trial.in_corner.any())
         of_speed = friction is not None and slides_otherwise(friction.limits.law)
-        return not (cornered or self.pair.trial.law_gap is not None or self.pair.tie or self.pair.heats or of_speed)
+        return not (cornered or self.pair.trial.has_law or self.pair.tie or self.pair.heats or of_speed)
 
     def limits(self) -> tuple[Array, Array]:
         """Slopes of the limits of friction by the normal multiplier, and limits at zero multiplier ``(k,)`` (collective)."""

@@ -104,7 +104,7 @@ class BodySystem:
         """Collect the pairs that may be in contact on any rank; iterations loop over these only."""
         self.near: list[Interface] = in_question(self.pairs)
         self._heats: list[Heat] = [heat for pair in self.near for heat in pair.heats]
-        self._soft = any(pair.trial.law_gap is not None for pair in self.near)
+        self._soft = any(pair.trial.has_law for pair in self.near)
 
     # -- projection of contactors ----------------------------------------------------------------------------------------
 

@@ -1,0 +1,194 @@
+"""The interface of a contact with cohesion: hard contact, and bonds whose tractions follow the openings until they are separated.
+
+With the mean opening w_i of a bond, its area A_i and the law t(w, damage) the residual is ``F + sum_i A_i r_i t_i`` with the gradients
+r_i of w_i, and its derivative has the terms ``sum_i A_i r_i (dt/dw) r_i'``, and the second derivatives of gaps that are kept. Both
+bodies are in the rows: action equals reaction. Contactors that close are united as in hard contact, where bonds have no traction along
+the normal. Normals are those at the beginning of the step, so that derivatives are exact.
+
+Damage is committed with the step. With friction, limits are those of the damaged part, by the damage at the beginning of the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.laws.cohesive import Cohesive, Response
+from uem_dolfinx.contact.laws.law import FrictionLaw
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.contact.ties.bonds import Bonds
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.parallel import reduced
+
+#: Bonds that have changed between growing, resting and broken damage so often in a step get the stiffness without growth, with which
+#: bodies come down to another equilibrium where the path jumps.
+#: [bound; changes in a step; -]
+MOST_SWINGS = 6
+#: After so many exchanges of contactors in one linearised problem all bonds get it, which makes the problem convex.
+#: [bound; exchanges; -]
+MOST_EXCHANGED = 4
+#: Columns of the state: damage, delayed damage and the load factor or time that it belongs to; the permanent opening and the normal of
+#: the next step follow.
+DAMAGE, DELAYED, AT, PERMANENT = range(4)
+
+
+def interface_of(law: Cohesive, contact: Any) -> Callable[..., Interface]:
+    """Class of a contact's interface; InputError for a law of points, which have no areas."""
+    if contact.contactor.dim == 0:
+        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
+    return partial(CohesiveInterface, law=law, contact=contact)
+
+
+class CohesiveInterface(Interface):
+    """Contactors with bonds, made by ``unite``; other arguments as for ``Interface``.
+
+    Args:
+        law: of the bonds.
+        contact: that it belongs to, for ``surface`` and the present load factor.
+    """
+
+    #: Its forces store and dissipate energy.
+    works = True
+
+    def __init__(self, *args: Any, law: Cohesive, contact: Any, **how: Any):
+        super().__init__(*args, **how)
+        assert isinstance(self.tie, Bonds)
+        self._law, self._contact, self._bonds = law, contact, self.tie
+        n, g = len(self.nodes), self.config.gdim
+        #: Derivatives of the bonds' forces by their equations, and without growth of damage ``(n, gdim, gdim)``.
+        self._tangent = self._secant = np.zeros((n, g, g))
+        #: Exchanges since the last placement.
+        self._exchanged = 0
+        #: Branch of the law of each bond at the last placement of this step, and how often it has changed ``(n,)``.
+        self._branch, self._changes = np.zeros(0, np.int64), np.zeros(n, np.int64)
+        #: Parameter of friction of surfaces without cohesion ``(n,)``.
+        self._mu: Array = np.zeros(n) if self.friction is None else self.friction.value
+
+    def unite(self, which: Bools | None = None) -> None:
+        """Make the bonds, intact, at the start (collective)."""
+        super().unite(which)
+        n, g = len(self.nodes), self.config.gdim
+        state = np.zeros((n, PERMANENT + 2 * g))
+        state[:, :AT] = np.where(self._bonds.bonded, 0.0, 1.0)[:, None]
+        state[:, AT], state[:, -g:] = self._contact._at, self.projection.normal
+        self.trial = self.committed = replace(self.committed, cohesion=state)
+        self._rub()
+
+    # -- tractions -------------------------------------------------------------------------------------------------------
+
+    def _project(self) -> None:
+        super()._project()
+        before = self.committed.cohesion
+        if before is None or self._bonds.rows is None:
+            return
+        # the load factor of another step begins at 0
+        at = float(self._contact._at)
+        passed = np.where(at < before[:, AT], at, at - before[:, AT])
+        permanent, normal = np.split(before[:, PERMANENT:], 2, axis=1)
+        kept = Response(*(np.zeros(0),) * 3, before[:, DAMAGE], before[:, DELAYED], permanent)
+        offsets = self._contact._offsets
+        # what an offset takes up is no opening
+        taken = 0.0 if offsets is None else offsets.declared[:, None] * normal
+        now = self._law.respond(self._bonds.openings() - taken, normal, kept, passed)
+        share = np.where(self._bonds.rows.share > 0.0, self._bonds.rows.share, 1.0)
+        area = self._bonds.bonded_areas(self._contact._areas)[:, None]
+        self._bonds.multipliers = -area * now.traction / share
+        self._bonds.holds = (area[:, 0] > 0.0) & (now.delayed < 1.0)
+        self._secant, tangent = ((area / share)[:, :, None] * part / share[:, None, :] for part in (now.secant, now.tangent))
+        self._tangent = np.where(self._swings(now, before)[:, None, None], self._secant, tangent)
+        self._exchanged = 0
+        states = np.column_stack([now.damage, now.delayed, np.full(len(area), at), now.permanent, normal])
+        self.trial = replace(self.trial, cohesion=states, bond=self._bonds.multipliers)
+
+    def _swings(self, now: Response, before: Array) -> Bools:
+        """Bonds that have changed between growing, resting and broken damage too often in this step ``(n,)``."""
+        here = np.where(now.damage >= 1.0, 2, np.where(now.damage > before[:, DAMAGE], 1, 0))
+        moved = here != self._branch if len(self._branch) else np.zeros(len(here), bool)
+        self._changes, self._branch = self._changes + moved, here
+        return self._changes > MOST_SWINGS
+
+    def exchange(self, violated: Violations) -> None:
+        """See ``Interface``; where exchanges do not end, growing damage has made the problem indefinite (collective)."""
+        super().exchange(violated)
+        self._exchanged += 1
+        if self._exchanged == MOST_EXCHANGED:
+            self._tangent, self._changes = self._secant, np.full(len(self.nodes), MOST_SWINGS + 1)
+
+    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+        """Terms of friction, and the stiffness of the bonds; see ``Interface``."""
+        own = super().slip_terms()
+        if self._bonds.rows is None:
+            return own
+        nodes, blocks = self._bonds.stiffness(self._tangent)
+        bonds = nodes, blocks, np.zeros(blocks.shape[:2])
+        return bonds if own is None else _together(own, bonds)
+
+    def displaced(self) -> float:
+        """See ``Told``."""
+        size = np.linalg.norm(self.points, axis=1, ord=np.inf) if len(self.nodes) else np.zeros(0)
+        stiff = np.abs(self._tangent).sum(axis=2).max(axis=1, initial=0.0)
+        return float(np.sqrt(2.0 * reduced(self.config.comm, float(((stiff * size) ** 2).sum()))))
+
+    # -- friction of the damaged part ------------------------------------------------------------------------------------
+
+    def _rubbing(self, value: Array) -> Array:
+        """Parameter of friction on the damaged part ``(n,)``."""
+        state = self.committed.cohesion
+        return value if state is None else value * state[:, DELAYED]
+
+    def _rub(self) -> None:
+        """Friction by the committed damage (collective)."""
+        if self.friction is not None:
+            super().set_friction(self.friction.limits.law, self._rubbing(self._mu))
+
+    def set_friction(self, law: FrictionLaw, value: Array) -> None:
+        """See ``Interface``; ``value (n,)`` is that of surfaces without cohesion (collective)."""
+        self._mu = value
+        super().set_friction(law, self._rubbing(value))
+
+    def know_friction(self, law: FrictionLaw, value: Array) -> None:
+        """See ``Told``; ``value (n,)`` is that of surfaces without cohesion (collective)."""
+        self._mu = value
+        super().know_friction(law, self._rubbing(value))
+
+    # -- from step to step -----------------------------------------------------------------------------------------------
+
+    def commit(self) -> None:
+        """See ``Interface``; bonds open along the normals of this state in the next step (collective)."""
+        if self.trial.cohesion is not None:
+            g = self.config.gdim
+            told = np.column_stack([self.trial.cohesion[:, :-g], self.projection.normal])
+            self.trial = replace(self.trial, cohesion=told)
+        super().commit()
+        self._rub()
+
+    def restore(self) -> None:
+        """See ``Interface``."""
+        super().restore()
+        self._branch, self._changes = np.zeros(0, np.int64), np.zeros(len(self.nodes), np.int64)
+
+    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
+        """See ``Interface``."""
+        super().remember(memory)
+        if self.friction is not None:
+            self.friction.set(self.friction.limits.law, self._rubbing(self._mu))
+
+
+def _together(a: tuple[Ints, Array, Array], b: tuple[Ints, Array, Array]) -> tuple[Ints, Array, Array]:
+    """Terms of two lists of contactors in one, of the wider blocks."""
+    (k, m), (n, o) = a[0].shape, b[0].shape
+    nodes, g = np.full((k + n, max(m, o)), -1, dtype=np.int64), (a[2].shape[1] // m if m else b[2].shape[1] // max(o, 1))
+    forces = np.zeros((k + n, nodes.shape[1] * g))
+    blocks = np.zeros((*forces.shape, forces.shape[1]))
+    for part, (rows, K, f) in ((slice(k), a), (slice(k, None), b)):
+        nodes[part, : rows.shape[1]] = rows
+        forces[part, : f.shape[1]] = f
+        blocks[part, : f.shape[1], : f.shape[1]] = K
+    return nodes, blocks, forces

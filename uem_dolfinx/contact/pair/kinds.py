@@ -1,0 +1,41 @@
+"""Kinds of interfaces and of ties that a contact's laws ask for; they are imported where they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from uem_dolfinx.arrays import Indices
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.placement import Discretisation
+
+if TYPE_CHECKING:
+    from uem_dolfinx.contact.ties.tie import Tie
+
+
+def kind_of_interface(contact: Any) -> Callable[..., Interface]:
+    """Class of a contact's interface: hard, soft or with cohesion."""
+    if contact.normal is not None:
+        from uem_dolfinx.contact.pair import soft
+
+        return soft.interface_of(contact.normal, contact)
+    if contact.cohesion is not None:
+        from uem_dolfinx.contact.pair import cohesive
+
+        return cohesive.interface_of(contact.cohesion, contact)
+    return Interface
+
+
+def tie_of(contact: Any, nodes: Indices, discretisation: Discretisation, means: Any, **of: Any) -> Tie | None:
+    """Permanent tie, or bonds, of a contact; ``means`` as in ``Tie``. None without."""
+    reach = None if isinstance(contact.adjust, bool) else contact.adjust
+    how: dict[str, Any] = {"means": means, "reach": reach, **of}
+    if contact.cohesion is not None:
+        from uem_dolfinx.contact.ties import bonds
+
+        return bonds.Bonds(contact.config, nodes, discretisation, **how)
+    if contact.tied:
+        from uem_dolfinx.contact.ties import tie
+
+        return tie.Tie(contact.config, nodes, discretisation, **how)
+    return None
