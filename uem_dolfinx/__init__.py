@@ -47,10 +47,11 @@ __all__ = [
     "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags",
     "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce",
     "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet",
-    "displacement_gradient", "ds", "dx", "error_estimate", "example_mesh", "figure", "form", "function_space", "generalised_alpha",
-    "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline",
-    "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_gmsh", "read_mesh",
-    "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh", "figure", "form", "function_space",
+    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
+    "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
+    "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings",
+    "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -66,6 +67,7 @@ except ImportError as _error:
         f"uem_dolfinx needs mpi4py and DOLFINx ({_error}): install python3-dolfinx-real on Debian, or pip install 'uem_dolfinx[wheel]'"
     ) from _error
 
+from uem_dolfinx import errors
 from uem_dolfinx.algebra.options import multigrid_options, saddle_options
 from uem_dolfinx.compat import function_space
 from uem_dolfinx.contact.contact import Contact

@@ -21,7 +21,7 @@ import ufl
 from dolfinx import cpp, fem, io, la, mesh
 from petsc4py import PETSc
 
-from uem_dolfinx.compiled import kept
+from uem_dolfinx.compiled import forget_logging_of_ffcx, kept
 from uem_dolfinx.errors import InputError, MissingBackendError
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ DOLFINX_VERSION: tuple[int, int] = tuple(int(part) for part in dolfinx.__version
 if DOLFINX_VERSION < (0, 6):
     # the compiler's set-up logs every command to the root logger; newer FFCx keeps them off the terminal in the same way
     logging.getLogger().addFilter(lambda record: record.levelno > logging.INFO or "distutils" not in record.pathname)
+    forget_logging_of_ffcx()
 
 # ---------------------------------------------------------------------------------------------- backends
 
@@ -309,10 +310,7 @@ def petsc_option_used(name: str) -> bool | None:
 
 
 def arrays_of(A: PETSc.Mat) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]] | None:
-    """Views of PETSc's arrays of a matrix on one rank: row starts, columns and values; None without access.
-
-    petsc4py only returns copies. The views are valid as long as the matrix exists and its sparsity is unchanged.
-    """
+    """Views of PETSc's arrays of a matrix on one rank, valid while its sparsity is: row starts, columns, values; or None."""
     rows, columns, values = found = [ctypes.c_void_p() for _ in range(3)]
     if A.getType() != "seqaij":
         return None

@@ -5,6 +5,7 @@ The time for this grows with the number of files: about 10 ms for each form with
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -31,6 +32,18 @@ def _meshes_kept(what: Any) -> Iterator[None]:
         for domain, element in domains:
             if domain.ufl_coordinate_element() is not element:
                 domain._ufl_coordinate_element = element
+
+
+def forget_logging_of_ffcx() -> None:
+    """Remove the handler that FFCx 0.5 gives the root logger, with which ``logging.basicConfig`` of a script has no effect."""
+    root = logging.getLogger()
+    usual = [
+        h for h in root.handlers if type(h) is logging.StreamHandler and getattr(h.formatter, "_fmt", "") == logging.BASIC_FORMAT
+    ]
+    if usual and usual == root.handlers and root.level == logging.WARNING:
+        root.handlers.clear()
+        # still the handler of scripts that configure nothing
+        logging.lastResort = usual[0]  # type: ignore[assignment]
 
 
 #: Options of users for the compiler.

@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, wraps
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
 
 from mpi4py import MPI
 
@@ -20,6 +21,8 @@ import numpy.typing as npt
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, InputTypeError
+
+W = TypeVar("W", bound=str)
 
 #: Values are shown with so many letters.
 #: [format; letters; -]
@@ -56,7 +59,7 @@ def described(value: object) -> str:
     if value is None or isinstance(value, (str, int, float, complex, list, tuple, dict, set, np.ndarray)):
         return re.sub(r" at 0x[0-9a-f]+", "", " ".join(repr(value).split()))
     name = type(value).__name__
-    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+    return f"{'an' if name[0] in 'AEIO' else 'a'} {name}"
 
 
 def shown(value: object) -> str:
@@ -125,13 +128,13 @@ def did_you_mean(value: Any, known: Collection[str], otherwise: str = "") -> str
     return f"did you mean {near[0]!r}?" if near else otherwise
 
 
-def word(what: str, value: Any, known: Sequence[str]) -> str:
+def word(what: str, value: Any, known: Sequence[W]) -> W:
     """One of the known words; InputError for other words, InputTypeError for other types."""
     if not isinstance(value, str) or value not in known:
         some = " or ".join(filter(None, [", ".join(map(repr, known[:-1])), repr(known[-1])]))
         error = InputError if isinstance(value, str) else InputTypeError
         raise error(sentence(what, value, f"one of {some}", did_you_mean(value, known) if isinstance(value, str) else ""))
-    return value
+    return known[known.index(value)]
 
 
 def name(what: str, value: Any, remedy: str = "") -> str:
@@ -223,6 +226,8 @@ class Sealed:
 
     SETTABLE: ClassVar[Mapping[str, Callable[[Any], Any] | None]] = {}
     _made = False
+    #: Arguments as given, where attributes of these names hold something else, for ``repr``.
+    _told: Mapping[str, Any] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Seal an object at the end of its outermost ``__init__``."""
@@ -238,6 +243,16 @@ class Sealed:
                 self._made = True
 
         cls.__init__ = making  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        """Its class, with the arguments that it was made with, as far as they are not the defaults."""
+        shows, kept = [], self.__dict__ | dict(self._told)
+        for name, parameter in inspect.signature(type(self)).parameters.items():
+            value = kept.get(name, kept.get(f"_{name}", parameter.default))
+            usual = value is parameter.default or (np.ndim(value) == 0 and value == parameter.default)
+            if not usual and value is not parameter.empty:
+                shows.append(f"{name}={shown(str(value) if isinstance(value, Path) else plain(value))}")
+        return f"{type(self).__name__}({', '.join(shows)})"
 
     @property
     def _called(self) -> str:

@@ -74,23 +74,26 @@ class PointSpring(given.Sealed):
         self.at = at
         words = "numbers that are not negative, one, one for each axis, or a symmetric matrix"
         try:
-            self._k = np.array(stiffness, dtype=float)
+            self._stiffness = np.array(stiffness, dtype=float)
         except (TypeError, ValueError):
             raise InputTypeError(given.sentence("stiffness", stiffness, words)) from None
-        k = np.diag(np.atleast_1d(self._k)) if self._k.ndim < 2 else self._k
+        k = np.diag(np.atleast_1d(self._stiffness)) if self._stiffness.ndim < 2 else self._stiffness
         square = k.ndim == 2 and k.shape[0] == k.shape[1] <= 3 and bool(np.isfinite(k).all())
         if not square or not np.array_equal(k, k.T) or np.linalg.eigvalsh(k)[0] < -np.finfo(float).eps * np.abs(k).max():
             raise InputError(given.sentence("stiffness", stiffness, words))
 
     def given_values(self) -> dict[str, Any]:
         """See ``PointLoad``."""
-        return {"the place": self.at if is_point(self.at) else None, "the stiffness": self._k}
+        return {"the place": self.at if is_point(self.at) else None, "the stiffness": self._stiffness}
 
     def force_and_stiffness(self, gdim: int) -> tuple[Array, Array | None]:
         """See ``PointLoad``."""
-        k = self._k * np.eye(gdim) if self._k.ndim == 0 else np.diag(self._k) if self._k.ndim == 1 else self._k
+        k = self._stiffness
+        k = k * np.eye(gdim) if k.ndim == 0 else np.diag(k) if k.ndim == 1 else k
         if k.shape != (gdim, gdim):
-            raise InputError(given.sentence("the stiffness of a PointSpring", self._k, f"a number, or {gdim} for each axis"))
+            raise InputError(
+                given.sentence("the stiffness of a PointSpring", self._stiffness, f"a number, or {gdim} for each axis")
+            )
         return np.zeros(gdim), k
 
 

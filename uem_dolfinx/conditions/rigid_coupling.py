@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -68,7 +68,7 @@ class RigidCoupling(given.Sealed):
         mass: float = 0.0,
         inertia: npt.ArrayLike = 0.0,
         distribute: bool = False,
-        rotations: str | None = None,
+        rotations: Literal["large", "small"] | None = None,
     ):
         self.where, self.name = where, "a point" if is_point(where) else name_of(where)
         self.point = given.vector("point", point)
@@ -83,6 +83,7 @@ class RigidCoupling(given.Sealed):
         given.kind("motion", motion, is_list, f"a list of {n} items, {words}")
         if len(motion) != n:
             raise InputError(given.sentence("motion", motion, f"{n} items, {words}"))
+        self._told = {"motion": motion if any(one is not None for one in motion) else None, "inertia": inertia}
         #: Values of the prescribed components by their number.
         self.prescribed = {i: checked_value(f"motion[{i}]", v, 1) for i, v in enumerate(motion) if v is not None}
         #: Force, moment and prescribed motion as declared, by name.

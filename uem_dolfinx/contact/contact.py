@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from mpi4py import MPI
 
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
 MAX_PENETRATION = 0.05
+COUPLINGS: tuple[Literal["node_to_surface", "mortar"], ...] = ("node_to_surface", "mortar")
+AFTER: tuple[Literal["after"]] = ("after",)
 BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size", lambda x: x >= 0)
 REACH = given.Range("True, False or a positive length", lambda x: x > 0)
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
@@ -118,12 +120,12 @@ class Contact(WatchedContact, given.Sealed):
         contactor: Part,
         target: Part | Target,
         *,
-        coupling: str | Callable[..., Discretisation] = "node_to_surface",
-        sliding: str = "finite",
-        normals: str = "facet",
+        coupling: Literal["node_to_surface", "mortar"] | Callable[..., Discretisation] = "node_to_surface",
+        sliding: Literal["finite", "small", "fixed"] = "finite",
+        normals: Literal["facet", "averaged"] = "facet",
         max_penetration: float | None = None,
         thickness: float | None = None,
-        tied: bool | str = False,
+        tied: bool | Literal["after"] = False,
         offset: Field = 0.0,
         adjust: float | bool = False,
         chords: bool = False,
@@ -132,7 +134,7 @@ class Contact(WatchedContact, given.Sealed):
         heat: Conductance | Sequence[Conductance] | None = None,
         normal: SoftContact | None = None,
         cohesion: Cohesive | None = None,
-        measure: str = "reference",
+        measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
     ):
         with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
@@ -140,7 +142,7 @@ class Contact(WatchedContact, given.Sealed):
             swap = "a rigid surface can only be the target: swap the two"
             given.kind("contactor", contactor, not hasattr(contactor, "project"), "a part of a mesh", swap)
             if not callable(coupling):
-                coupling = given.word("coupling", coupling, ("node_to_surface", "mortar"))
+                coupling = given.word("coupling", coupling, COUPLINGS)
             sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))
             normals = given.word("normals", normals, ("facet", "averaged"))
             if max_penetration is not None:
@@ -152,7 +154,7 @@ class Contact(WatchedContact, given.Sealed):
             self.heats = conductances_of(heat)
             self.normal = given_normal(normal, friction, wear, self.heats, tied)
             measure = given.word("measure", measure, ("reference", "current"))
-            tied = given.word("tied", tied, ("after",)) if isinstance(tied, str) else given.flag("tied", tied)
+            tied = given.word("tied", tied, AFTER) if isinstance(tied, str) else given.flag("tied", tied)
             if not isinstance(adjust, (bool, np.bool_)):
                 adjust = given.number("adjust", adjust, REACH)
             self._offset = given_field("offset", offset)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 from mpi4py import MPI
 
@@ -56,8 +56,8 @@ class Preload(Contact):
         axis: npt.ArrayLike | None = None,
         *,
         force: float | Callable[[float], float],
-        coupling: str | Callable[..., Discretisation] = "node_to_surface",
-        measure: str = "reference",
+        coupling: Literal["node_to_surface", "mortar"] | Callable[..., Discretisation] = "node_to_surface",
+        measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
     ):
         with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from mpi4py import MPI
 
@@ -374,7 +374,19 @@ class ContactResults:
         f.x.scatter_forward()
         return f
 
-    def resultant(self, about: npt.ArrayLike | None = None, *, on: str = "contactor") -> Resultant:
+    def force_on(self, side: Literal["contactor", "target"]) -> fem.Function:
+        """Nodal contact forces on one of the bodies, as a vector field; zero on a rigid target, which has no nodes (collective).
+
+        Args:
+            side: ``"contactor"`` or ``"target"``; the sum of both fields is :attr:`force`.
+        """
+        given.word("side", side, ("contactor", "target"))
+        f = self._field(f"force_on_{side}", self.pair.trial.force, vector=True)
+        if side == "target":
+            f.x.array[:] = self.force.x.array - f.x.array
+        return f
+
+    def resultant(self, about: npt.ArrayLike | None = None, *, on: Literal["contactor", "target"] = "contactor") -> Resultant:
         """Force and moment that the contact exerts on one of the bodies (collective).
 
         In axisymmetry it is the resultant on the whole body: radial forces cancel, and ``normal`` is the sum of the normal forces

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -77,7 +77,7 @@ class Dynamics(given.Sealed):
         velocity: fem.Function | npt.ArrayLike | None = None,
         gravity: npt.ArrayLike | None = None,
         damping: Callable[[Expr], ufl.Form] | None = None,
-        contactors: str = "massless",
+        contactors: Literal["massless", "massy"] = "massless",
         time: float = 0.0,
     ):
         given.kind("mass", mass, isinstance(mass, Mass), "a Mass", "made by uem.lumped_mass(V, density) or uem.consistent_mass")

@@ -299,16 +299,17 @@ class RigidPlane(RigidSurface):
     Args:
         point: on the plane ``(gdim,)``.
         normal: out of the target ``(gdim,)``, of any length.
+        name: for messages, files and ``GeneralContact.between``.
     """
 
     measures = True
 
-    def __init__(self, point: npt.ArrayLike, normal: npt.ArrayLike):
+    def __init__(self, point: npt.ArrayLike, normal: npt.ArrayLike, *, name: str = "rigid plane"):
         p = given.vector("rigid plane: point", point)
         n = given.direction("rigid plane: normal", normal, len(p))
         super().__init__(
             lambda x: (x - p) @ n, lambda x: np.tile(n, (len(x), 1)), lambda x: np.zeros((len(x), len(n), len(n))),
-            name="rigid plane", reference=p,
+            name=name, reference=p,
         )  # fmt: skip
 
 
@@ -319,11 +320,12 @@ class RigidSphere(RigidSurface):
         center: ``(gdim,)``.
         radius: a length.
         inside: the target is the space around the ball, and bodies touch it from inside.
+        name: as of a ``RigidPlane``.
     """
 
     measures = True
 
-    def __init__(self, center: npt.ArrayLike, radius: float, inside: bool = False):
+    def __init__(self, center: npt.ArrayLike, radius: float, inside: bool = False, *, name: str = "rigid sphere"):
         c, radius = given.vector("rigid sphere: center", center), given.length("rigid sphere: radius", radius)
         side = -1.0 if given.flag("rigid sphere: inside", inside) else 1.0
 
@@ -337,7 +339,7 @@ class RigidSphere(RigidSurface):
 
         super().__init__(
             lambda x: side * (arm(x)[0] - radius), lambda x: side * arm(x)[1], hessian,
-            name="rigid sphere", reference=c, stride=radius,
+            name=name, reference=c, stride=radius,
         )  # fmt: skip
 
 
@@ -349,11 +351,14 @@ class RigidCylinder(RigidSurface):
         axis: its direction ``(3,)``, of any length.
         radius: a length.
         inside: the target is the space around the cylinder, and bodies touch it from inside.
+        name: as of a ``RigidPlane``.
     """
 
     measures = True
 
-    def __init__(self, point: npt.ArrayLike, axis: npt.ArrayLike, radius: float, inside: bool = False):
+    def __init__(
+        self, point: npt.ArrayLike, axis: npt.ArrayLike, radius: float, inside: bool = False, *, name: str = "rigid cylinder"
+    ):
         a, p = given.direction("rigid cylinder: axis", axis, 3), given.vector("rigid cylinder: point", point, 3)
         radius, inside = given.length("rigid cylinder: radius", radius), given.flag("rigid cylinder: inside", inside)
         across = np.eye(3) - np.outer(a, a)
@@ -366,7 +371,7 @@ class RigidCylinder(RigidSurface):
 
         super().__init__(
             lambda x: ball.distance((x - p) @ across), lambda x: ball.gradient((x - p) @ across), hessian,
-            name="rigid cylinder", reference=p, stride=radius,
+            name=name, reference=p, stride=radius,
         )  # fmt: skip
 
 
@@ -377,9 +382,10 @@ class RigidParaboloid(RigidSurface):
         apex: ``(gdim,)``.
         axis: from the apex into the solid ``(gdim,)``, of any length.
         radius: radius of curvature at the apex, a length.
+        name: as of a ``RigidPlane``.
     """
 
-    def __init__(self, apex: npt.ArrayLike, axis: npt.ArrayLike, radius: float):
+    def __init__(self, apex: npt.ArrayLike, axis: npt.ArrayLike, radius: float, *, name: str = "rigid paraboloid"):
         o, radius = given.vector("rigid paraboloid: apex", apex), given.length("rigid paraboloid: radius", radius)
         a = given.direction("rigid paraboloid: axis", axis, len(o))
         across = np.eye(len(o)) - np.outer(a, a)
@@ -390,7 +396,7 @@ class RigidParaboloid(RigidSurface):
 
         super().__init__(
             distance, lambda x: (x - o) @ across / radius - a, lambda x: np.tile(across / radius, (len(x), 1, 1)),
-            name="rigid paraboloid", reference=o,
+            name=name, reference=o,
         )  # fmt: skip
 
 

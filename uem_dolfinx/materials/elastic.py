@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 import ufl
@@ -20,7 +20,8 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, is_axisymmetric
 from uem_dolfinx.parallel import agree
 
-KINDS = ("3d", "plane_strain", "plane_stress", "axisymmetric")
+Kind: TypeAlias = Literal["3d", "plane_strain", "plane_stress", "axisymmetric"]
+KINDS: tuple[Kind, ...] = ("3d", "plane_strain", "plane_stress", "axisymmetric")
 #: Poisson's ratios of bodies that resist every strain.
 POISSON = given.between(-1.0, 0.5, "a body that hardly changes its volume has 0.4999, with residual_form")
 
@@ -42,7 +43,7 @@ class Elastic(ABC):
 
     E: Any
     nu: Any
-    kind: str = "3d"
+    kind: Kind = "3d"
 
     def __post_init__(self) -> None:
         given.word("kind", self.kind, KINDS)

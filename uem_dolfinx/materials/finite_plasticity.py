@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import ufl
@@ -86,7 +86,7 @@ class FinitePlasticity(VonMises):
         *,
         kinematic_hardening: Any = 0.0,
         displacement: int | None = None,
-        kind: str = "3d",
+        kind: Literal["3d", "plane_strain", "axisymmetric"] = "3d",
         cells: Part | None = None,
         quadrature_degree: int | None = None,
     ):

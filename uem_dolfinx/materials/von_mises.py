@@ -8,7 +8,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import ufl
@@ -21,7 +21,7 @@ from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import centre_of_mass, displacement_gradient
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.log import timed
-from uem_dolfinx.materials.elastic import KINDS, POISSON, check_kind, green_lagrange
+from uem_dolfinx.materials.elastic import KINDS, POISSON, Kind, check_kind, green_lagrange
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints, owned_cells
 from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
 from uem_dolfinx.parallel import agree
@@ -113,8 +113,8 @@ class VonMises(given.Sealed):
         *,
         kinematic_hardening: Any = 0.0,
         displacement: int | None = None,
-        kind: str = "3d",
-        strain: str = "small",
+        kind: Kind = "3d",
+        strain: Literal["small", "green_lagrange"] = "small",
         cells: Part | None = None,
         quadrature_degree: int | None = None,
     ):
@@ -130,6 +130,7 @@ class VonMises(given.Sealed):
         self.cells = owned_cells(self.mesh, cells)
         degrees = self._degrees(degree, quadrature_degree)
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
+        self._told = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening, "cells": cells}
         self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
         #: Yield stress over peeq; with a table, the yield curve of the layers.
         self._curve: YieldCurve

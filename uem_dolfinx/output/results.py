@@ -74,7 +74,7 @@ class HistoryWriter(Closing, given.Sealed):
     ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         until = problem.progress if resume else None
-        self.problem, dynamics = problem, problem.dynamics
+        self.path, self.problem, dynamics = Path(path), problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         names = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
         suffixes, resultant = contact_suffixes(problem.declared), [f"force_{a}" for a in axes] + [f"moment_{a}" for a in turns]
@@ -197,7 +197,7 @@ class ResultsWriter(Closing, given.Sealed):
     ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         self.problem, comm, mesh = problem, problem.comm, problem.config.mesh
-        self._stem = given_path("path", path, comm)
+        self.path = self._stem = given_path("path", path, comm)
         with agreed(comm):
             _check_fields(fields, mesh)
             vtx = None if vtx is None else given.flag("vtx", vtx)

@@ -52,7 +52,7 @@ class SurfaceWriter(Closing, given.Sealed):
     def __init__(self, path: str | Path, problem: UnitedProblem):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         self.problem, comm = problem, problem.comm
-        self._stem = given_path("path", path, comm)
+        self.path = self._stem = given_path("path", path, comm)
         with agreed(comm):
             _require()
             if not problem.declared:

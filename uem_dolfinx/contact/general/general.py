@@ -8,7 +8,7 @@ With mortar there is one contact for each target body.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from mpi4py import MPI
 
@@ -18,7 +18,7 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.contact import BOUND, MAX_PENETRATION, Contact
+from uem_dolfinx.contact.contact import BOUND, COUPLINGS, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
@@ -81,10 +81,10 @@ class GeneralContact(OfProblem, given.Sealed):
         self_contact: bool | Sequence[Part] = False,
         bodies: dict[str, Part] | None = None,
         friction: Field | FrictionLaw | dict[Any, Field | FrictionLaw] = 0.0,
-        coupling: str = "node_to_surface",
-        normals: str = "facet",
+        coupling: Literal["node_to_surface", "mortar"] = "node_to_surface",
+        normals: Literal["facet", "averaged"] = "facet",
         max_penetration: float | None = None,
-        measure: str = "reference",
+        measure: Literal["reference", "current"] = "reference",
         name: str = "general contact",
         normal: SoftContact | None = None,
         heat: Conductance | Sequence[Conductance] | None = None,
@@ -100,7 +100,7 @@ class GeneralContact(OfProblem, given.Sealed):
             named = isinstance(bodies, dict) and all(isinstance(key, str) for key in bodies)
             given.kind("bodies", bodies, bodies is None or named, "names and parts, {name: part}, or None")
             self._pairs = self._friction_of_pairs(friction)
-            self.coupling = given.word("coupling", coupling, ("node_to_surface", "mortar"))
+            self.coupling = given.word("coupling", coupling, COUPLINGS)
             self.normals = given.word("normals", normals, ("facet", "averaged"))
             for word, handed, usual in (("normals", normals, "facet"), ("self_contact", self_contact, False)):
                 if coupling == "mortar" and handed != usual:

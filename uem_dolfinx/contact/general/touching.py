@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -89,6 +89,12 @@ def sums_of_pairs(
     return [Pair(Touch(a, b, int(row[0]), row[3 : 3 + g]), row[3 + g :], float(row[1]), float(row[2])) for a, b, row in of]
 
 
+def _whole_name(one: Any, names: Sequence[str]) -> Any:
+    """A name with the number of the rigid surface, if it is that of one surface alone and was given without."""
+    found = [name for name in names if name.rpartition(" ")[0] == one]
+    return found[0] if one not in names and len(found) == 1 else one
+
+
 def between(
     pairs: Sequence[Pair], names: Sequence[str], first: str, second: str | None, nothing: Resultant
 ) -> tuple[Resultant, float]:
@@ -97,6 +103,7 @@ def between(
     Raises:
         InputError: for an unknown name.
     """
+    first, second = (_whole_name(one, names) for one in (first, second))
     given.word("first", first, names)
     if second is not None:
         given.word("second", second, names)
