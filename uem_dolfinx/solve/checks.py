@@ -138,6 +138,18 @@ def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
         )
 
 
+def check_hold(problem: Any) -> None:
+    """Raise an InputError unless the conditions of a problem can be replaced between time steps."""
+    if problem.dynamics is None:
+        raise InputError("hold() is for time steps: in statics take load_steps(problem, [Step(bcs=...)])")
+    from uem_dolfinx.dynamics.explicit.refused import is_explicit
+
+    if is_explicit(problem.dynamics):
+        raise InputError("hold() does not go with CentralDifferences: take an implicit scheme, as uem.newmark()")
+    if problem.history is not None:
+        raise InputError("hold() while the problem is being recorded: record steps with the same conditions")
+
+
 def check_conditions(config: Configuration, bcs: Any) -> list[Any]:
     """The Dirichlet conditions as a list, all of them of the displacement's space or of a part of it.
 

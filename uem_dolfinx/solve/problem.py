@@ -33,7 +33,7 @@ from uem_dolfinx.solve.bodies.norms import Norm
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads, values_at
 from uem_dolfinx.solve.reactions import reactions
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
-from uem_dolfinx.solve.stepping import Progress
+from uem_dolfinx.solve.stepping import Progress, hold_others
 from uem_dolfinx.solve.taken import taken_by
 from uem_dolfinx.solve.united.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.united.system import BodySystem
@@ -272,6 +272,17 @@ class UnitedProblem(given.Sealed):
 
             free, nodes = self.bodies.free[: self.config.n_owned], [pair.nodes for pair in self.pairs]
             self.linear = rows_of_users(self.config, equations, couplings, free, nodes + followed, load, at)
+
+    def hold(self, bcs: Sequence[fem.DirichletBC]) -> None:
+        """Replace all Dirichlet conditions between two time steps; in statics use ``Step(bcs=...)`` (collective).
+
+        Raises:
+            InputError, InputTypeError, SpaceError: in statics, with an explicit scheme or while recording, or for other conditions.
+        """
+        with agreed(self.comm):
+            checks.check_hold(self)
+            bcs = checks.check_conditions(self.config, bcs)
+        hold_others(self, bcs)
 
     def set_load(self, at: float, known: bool = False) -> None:
         """Set ``load``, contacts and equations to a load factor or a time; UserFunctionError if a function raises (collective).

@@ -18,6 +18,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
 from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.taken import Taken
@@ -277,3 +278,27 @@ def between_steps(
         raise
     finally:
         (progress.interruption, progress.end), progress.inside = outer, False
+
+
+def hold_others(problem: Any, bcs: Sequence[Any]) -> None:
+    """Replace the Dirichlet conditions of a problem in time, checked, between two steps (collective).
+
+    The acceleration of what is released follows from the forces at this instant, as at the start.
+    """
+    from uem_dolfinx.contact.switched import hold
+
+    bodies, dynamics, config, held = problem.bodies, problem.dynamics, problem.config, problem.bodies.held
+    bodies.hold(bcs)
+    changed = held != bodies.held
+    if not reduced(problem.comm, bool(changed.any()), op=MPI.LOR):
+        return
+    free = bodies.free[: config.n_owned]
+    dynamics.hold(~free)
+    for pair in problem.interfaces:
+        hold(pair, free, config.of(changed).any(axis=1))
+    if problem.linear is not None:
+        problem.unite(problem.load, dynamics.time)
+        problem.system.take(problem.interfaces, problem.linear)
+    problem.set_load(dynamics.time, known=True)
+    dynamics.accelerated = False
+    problem.system.accelerate()
