@@ -7,18 +7,21 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output import pictures3d
 from uem_dolfinx.output.frames import Frame, Gathering, Pieces
 from uem_dolfinx.output.sections import Shape, grid
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: A field that varies by less is the same everywhere, and drawn in one colour; what is outside the window by less is in it; forces that
@@ -39,7 +42,9 @@ class Drawing:
         surface: Part | None, percentiles: Sequence[float] | None, rigid: bool, triad: bool,
     ):  # fmt: skip
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
-        gdim, pressed = problem.config.gdim, isinstance(field, Contact)
+        # the pressure of a contact is drawn as the contact itself: up to date, and grey where it is open
+        field = next((one for one in problem.declared if field is not None and field is one._fields.get("pressure")), field)
+        gdim, pressed = problem.config.gdim, isinstance(field, Contact | GeneralContact)
         with agreed(problem.comm):
             for name, value in ({"mirror": mirror} if gdim == 3 else {"surface": surface}).items():
                 _refuse_of_other_dimension(gdim, name, value)
@@ -48,7 +53,7 @@ class Drawing:
             elif len(levels) < 2 or not (np.diff(given.vector("levels", levels, len(levels))) > 0).all():  # type: ignore[arg-type]
                 raise InputError(given.sentence("levels", levels, "the number of colours, or two or more bounds that grow"))
             if isinstance(field, (list, tuple)) and len(field):
-                pressed = bool(given.items("field", field, lambda one: isinstance(one, Contact), "a contact"))
+                pressed = bool(given.items("field", field, lambda one: isinstance(one, Contact | GeneralContact), "a contact"))
             elif not (field is None or pressed or getattr(field, "ufl_shape", None) == ()):
                 raise InputError(given.sentence("field", field, FIELD))
             scale = given.number("scale", scale)
@@ -60,12 +65,17 @@ class Drawing:
                         given.sentence("percentiles", percentiles, "two of them, from 0 to 100, the smaller one first")
                     )
             self.view = checked_view(gdim, view)
+            found = np.array([problem.config.x.min(axis=0, initial=np.inf), -problem.config.x.max(axis=0, initial=-np.inf)])
             if hasattr(field, "ufl_shape"):
                 check_values("field", field, problem.config.mesh.ufl_domain(), "the displacement's mesh")
             if problem.comm.rank == 0:
                 _check_colours(cmap)
         if gdim == 3:
             pictures3d.require(problem.comm)
+            low, high = reduced(problem.comm, found, op=MPI.MIN) * [[1.0], [-1.0]]
+            if view is None and box is not None:
+                # towards the sections, where the window cuts at one side
+                self.view = np.where((box[:, 0] > low) & (box[:, 1] >= high), -1.0, 1.0) * self.view
         size = "|u|" if problem.config.moves else problem.u.name
         self.label = label or (size if field is None else "contact pressure" if pressed else "")
         self.levels, self.window, self.mirror, self.cells, self.cmap = levels, window, mirror, cells, cmap

@@ -14,6 +14,7 @@ from dolfinx.mesh import exterior_facet_indices
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.mesh_sizes import FILLED_BY
 from uem_dolfinx.geometry.tags import Part, as_tag
@@ -130,7 +131,7 @@ def vertex_values(problem: UnitedProblem, field: Any) -> Array:
         return np.asarray(np.linalg.norm(moved, axis=1))
     if isinstance(field, Sequence):
         return np.asarray(sum(vertex_values(problem, contact) for contact in field))
-    if isinstance(field, Contact):
+    if isinstance(field, Contact | GeneralContact):
         field = field.pressure
     if isinstance(field, fem.Function) and compat.lagrange_degree(field.function_space):
         linear = fem.Function(compat.function_space(mesh, 1))

@@ -145,7 +145,8 @@ def plot_scene(
         picture: name of the picture, or a panel of :func:`figure` (None on ranks other than 0). By default the picture is returned, and
             Jupyter shows it.
         field: scalar UFL expression, averaged at the nodes of each body; a scalar Lagrange Function, drawn with its values at the
-            vertices; a contact or a list of contacts, for their pressure, grey elsewhere; None is the magnitude of the displacement.
+            vertices; a contact, a general contact, its ``pressure`` or a list of contacts, for their pressure, grey elsewhere and where
+            they are open; None is the magnitude of the displacement.
         label: of the colour bar.
         levels: number of colours, or their bounds.
         scale: magnification of the displacement.
@@ -156,7 +157,8 @@ def plot_scene(
         arrows: draw the contact forces per tributary area, on the contactors; the default in 2D. In 3D they are visible if only the
             contactor is drawn, by ``surface``.
         cmap: colour map.
-        view: direction from the scene to the eye ``(3,)``; None or ``"iso"`` is (1, 1, 1); 3D only.
+        view: direction from the scene to the eye ``(3,)``; ``"iso"`` is (1, 1, 1), and so is None, with signs by which the
+            sections of a ``window`` are seen; 3D only.
         surface: draw only these facets, such as a contactor hidden by bodies: a tag, or any surface of a contact; 3D only.
         percentiles: percentiles of the visible values for the range of colours, such as ``(1, 99)``, so that a few large values, e.g.
             at corners, do not dominate; None uses all values.
