@@ -202,7 +202,7 @@ class Dynamics(given.Sealed):
         massy = int(reduced(self.config.comm, int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
         if self.contactors == "massless":
             self.mass = without_surfaces(self.mass, contacts)
-        elif massy:
+        elif massy and isinstance(self.scheme, Scheme):
             logger.warning(
                 "%d contactors have mass: impact will set them in vibration, and the trapezoidal rule then adds energy at every touch; "
                 "contactors='massless' avoids both",

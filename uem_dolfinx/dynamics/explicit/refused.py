@@ -34,19 +34,16 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
             raise InputError(f"{name} does not go with CentralDifferences: {remedy}")
     if dynamics.damping is not None:
         raise InputError(f"damping does not go with CentralDifferences, whose steps it would shorten: {remedy}")
-    if dynamics.contactors != "massless":
-        raise InputError(
-            "contactors='massy' does not go with CentralDifferences, whose contact is exact on a surface without mass"
-        )
     if not dynamics.mass.diagonal:
         raise InputError(
             "CentralDifferences divide forces by masses: expected a lumped mass; make it by uem.lumped_mass(V, density)"
         )
     for contact in contacts:
         name = f"contact '{contact.name}'"
-        if isinstance(contact, GeneralContact):
+        if isinstance(contact, GeneralContact) and dynamics.contactors == "massless":
             raise InputError(
-                f"{name}: GeneralContact, whose surfaces may keep mass, does not go with CentralDifferences: name each contact"
+                f"{name}: GeneralContact, whose surfaces may keep mass, does not go with CentralDifferences and massless contactors: "
+                "take Dynamics(..., contactors='massy'), or name each contact"
             )
         if getattr(contact, "tied", False):
             raise InputError(f"{name} is tied, and its nodes have mass, which CentralDifferences move freely: {remedy}")

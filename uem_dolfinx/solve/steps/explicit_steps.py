@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
+from uem_dolfinx.dynamics.explicit.with_mass import StepperWithMass
 from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import gathered
@@ -30,7 +31,8 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     Raises:
         InputError: if ``dt`` exceeds the critical step.
     """
-    control, dynamics, stepper = problem.step_control, problem.dynamics, ExplicitStepper(problem)
+    control, dynamics = problem.step_control, problem.dynamics
+    stepper = (ExplicitStepper if dynamics.contactors == "massless" else StepperWithMass)(problem)
     resumed = dt is None and dynamics.resumed and dynamics.time > dynamics.start
     problem.set_load(dynamics.time)
     if not dynamics.accelerated:

@@ -1,0 +1,135 @@
+"""Central differences for contactors that keep their mass: waves, momentum, friction, general contact, what is lost in impacts."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import at, box, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.parallel import reduced
+
+COMM = MPI.COMM_WORLD
+C, LENGTH = 30.0, 10.0
+SHAPES = {2: "quadrilateral", 3: "hexahedron"}
+
+
+def bars(dim=2, cells=40, speed=1.0, gap=0.05, lower=False, general=False, coupling="node_to_surface", degree=1, wide=1):
+    """Bars of density 1 that fly down onto a wall at 0, or onto a second bar in flight; the problem and the contact."""
+    across = [1.0] * (dim - 1)
+    starts = [-LENGTH, gap] if lower else [gap]
+    parts = [
+        box(SHAPES[dim], [*[0.0] * (dim - 1), y], [*across, y + LENGTH], [*[wide + k] * (dim - 1), cells])
+        for k, y in enumerate(starts)
+    ]
+    s = scene(COMM, SHAPES[dim], parts)
+    V = compat.function_space(s.mesh, degree, (dim,))
+    u, v, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
+    upper = V.tabulate_dof_coordinates()[:, dim - 1] > 0.5 * gap
+    velocity.x.array.reshape(-1, dim)[upper, dim - 1] = -speed
+    law = uem.LinearElastic(C**2, 0.0, kind="plane_stress" if dim == 2 else "3d")
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity, scheme=uem.CentralDifferences(), contactors="massy")
+    plane = uem.RigidPlane(np.zeros(dim), np.eye(dim)[-1])
+    top = plane if not lower else s.tag("top", 0, at(dim - 1, 0.0))
+    contact = uem.Contact(s.tag("bottom", len(starts) - 1, at(dim - 1, gap)), top, coupling=coupling)
+    if general:
+        contact = uem.GeneralContact(rigid=[] if lower else [plane])
+    problem = uem.UnitedProblem(law.residual(u, v) * ufl.dx, u, contacts=[contact], dynamics=dynamics, rtol=1e-10)
+    return problem, contact, law.energy(u) * ufl.dx
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"general": True}, {"coupling": "mortar"}, {"dim": 3, "cells": 20}, {"dim": 3, "cells": 20, "general": True}],
+    ids=str,
+)
+def test_a_bar_on_a_wall(how):
+    """The wall feels rho c v for the time 2 L / c, and energy is lost with the mass of the surface alone."""
+    problem, _, stored = bars(**how)
+    book, rows = uem.EnergyBook(problem, stored), []
+    for step in uem.time_steps(problem, end=0.05 + 2 * LENGTH / C + 0.1):
+        row = book.write(step)
+        rows.append((step.time, row.kinetic + row.stored, book.momenta[-1][-1]))
+    t, energy, momentum = np.array(rows).T
+    force = -np.gradient(-momentum, t)
+    plateau = force[(t > 0.15) & (t < 0.65)]
+    cell = LENGTH / how.get("cells", 40)
+    assert abs(plateau.mean() / C - 1) < 0.02
+    on = t[force > 0.3 * C]
+    assert abs(on[0] - 0.05) < 2 * cell / C and abs(on[-1] - 0.05 - 2 * LENGTH / C) < 3 * cell / C
+    # half a cell of mass stops at the wall
+    lost = 1.0 - energy[-1] / book.rows[0].kinetic
+    assert 0.0 <= lost < 1.3 * 0.5 * cell / LENGTH
+
+
+def test_what_is_lost_is_of_the_mesh():
+    """Twice as many cells lose half as much energy."""
+    lost = []
+    for cells in (20, 40, 80):
+        problem, _, stored = bars(cells=cells)
+        book = uem.EnergyBook(problem, stored)
+        for step in uem.time_steps(problem, end=0.8):
+            row = book.write(step)
+        lost.append(1.0 - (row.kinetic + row.stored) / book.rows[0].kinetic)
+    assert 0.8 < np.log2(lost[0] / lost[1]) < 1.2 and 0.8 < np.log2(lost[1] / lost[2]) < 1.2, lost
+
+
+@pytest.mark.parametrize(
+    "how", [{"cells": 20}, {"cells": 20, "general": True}, {"cells": 20, "coupling": "mortar"}, {"dim": 3, "cells": 10}], ids=str
+)
+def test_momentum_of_two_bars(how):
+    """A bar hits a bar at rest: momentum stays to rounding, and they exchange their velocities."""
+    problem, _, stored = bars(lower=True, **how)
+    book = uem.EnergyBook(problem, stored)
+    for step in uem.time_steps(problem, end=0.05 + 2 * LENGTH / C + 0.2):
+        book.write(step)
+    momenta = np.array(book.momenta)[:, -1]
+    assert np.abs(momenta / momenta[0] - 1).max() < 1e-9
+    config, dynamics = problem.config, problem.dynamics
+    v = dynamics.velocity.x.array.reshape(-1, config.gdim)[: config.n_owned, -1]
+    m = dynamics.mass.of_nodes[:, -1]
+    upper = config.X[: config.n_owned, -1] > 0.025
+    sums = [reduced(COMM, float(of.sum())) for of in (m[upper] * v[upper], m[~upper] * v[~upper])]
+    assert abs(sums[0]) < 0.05 * LENGTH and abs(sums[1] + LENGTH) < 0.05 * LENGTH
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_a_block_slides_to_rest(coupling):
+    """Friction stops a block with mu g, in closed form, and holds it."""
+    mu, g, speed = 0.3, 10.0, 1.0
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 0.2], [3, 1])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    law = uem.LinearElastic(1e3, 0.0, kind="plane_stress")
+    contact = uem.Contact(
+        s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane(np.zeros(2), np.array([0.0, 1.0])), friction=mu, coupling=coupling
+    )
+    dynamics = uem.Dynamics(
+        uem.lumped_mass(V, 1.0), velocity=(speed, 0.0), gravity=(0.0, -g), scheme=uem.CentralDifferences(), contactors="massy"
+    )
+    problem = uem.UnitedProblem(law.residual(u, v) * ufl.dx, u, contacts=[contact], dynamics=dynamics)
+    for step in uem.time_steps(problem, end=1.1 * speed / (mu * g)):
+        pass
+    way = speed**2 / (2 * mu * g)
+    m, own = dynamics.mass.of_nodes[:, 0], slice(problem.config.n_owned)
+    mean = reduced(COMM, float((m * u.x.array.reshape(-1, 2)[own, 0]).sum())) / reduced(COMM, float(m.sum()))
+    assert abs(mean / way - 1) < 0.02
+
+
+def test_massless_nodes_are_refused():
+    """Free nodes without mass cannot be moved."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [2, 2]),
+                                      box("quadrilateral", [0.0, 2.0], [1.0, 3.0], [2, 2])])  # fmt: skip
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    x = ufl.SpatialCoordinate(s.mesh)
+    mass = uem.lumped_mass(V, ufl.conditional(ufl.lt(x[1], 1.5), 0.0, 1.0))
+    form = uem.LinearElastic(1.0, 0.0, kind="plane_stress").residual(u, v) * ufl.dx
+    problem = uem.UnitedProblem(form, u, dynamics=uem.Dynamics(mass, scheme=uem.CentralDifferences(), contactors="massy"))
+    with pytest.raises(uem.MassError, match="have no mass"):
+        next(uem.time_steps(problem, end=1.0))

@@ -1,0 +1,167 @@
+"""Explicit steps for contactors that keep their mass: nodes move freely, then contact corrects them by a united system of masses.
+
+Bodies move by central differences to ``u*``. With the masses M in place of the stiffness, the united system
+
+    P'(M / dt^2) P dq = P'((M / dt^2) (u* - u) - (M / dt^2) c)
+
+finds the nearest state, in the norm of M, whose gaps are closed and whose contactors stick or slip: contact forces act for the whole step.
+A node that touches takes the normal velocity of its target, as in a plastic impact: what is lost is the energy of the surface's mass.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx import compat
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.warnings.checks import check_moved
+from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
+from uem_dolfinx.errors import MassError, UEMError
+from uem_dolfinx.solve.bodies.bodies import Bodies, solver_of
+from uem_dolfinx.solve.passages import refuse_passages
+from uem_dolfinx.solve.united.newton import solve_united
+from uem_dolfinx.solve.united.system import BodySystem
+
+#: Masses are diagonal: a factorisation fills in where contacts couple unknowns alone.
+OPTIONS = {"ksp_type": "preonly", "pc_type": "lu"}
+
+
+class InertBodies(Bodies):
+    """Bodies of a problem without stiffness, whose nodes return to a freely moved state by their inertia over a step.
+
+    Args:
+        bodies: of the problem.
+        mass: of the owned components ``(n,)``.
+    """
+
+    def __init__(self, bodies: Bodies, mass: Array):
+        self.__dict__.update(bodies.__dict__)
+        self._mass, self._b = mass, compat.create_vector(bodies.u.function_space)
+        self.materials, self.points, self.dead, self._assembled_at = [], None, None, None
+        # lines of a node have the same columns, as in K
+        g = bodies.config.gdim
+        K = PETSc.Mat().createAIJ(bodies.tangent.K.getSizes(), bsize=g, nnz=g, comm=bodies.comm)
+        first, last = K.getOwnershipRange()
+        for node in range(first // g, last // g):
+            K.setValuesBlocked([node], [node], np.zeros((g, g)))
+        K.assemble()
+        K.setOption(PETSc.Mat.Option.SPD, True)
+        #: M over the square of the step.
+        self.tangent: Any = SimpleNamespace(K=K, linear=True, given=False, bare=None, number=0, update=lambda: None)
+        self.free_to: Array = np.zeros(len(mass))
+        self._factor = np.zeros(0)
+        self.begin(1.0, self.free_to)
+
+    def begin(self, dt: float, free_to: Array) -> None:
+        """Begin a step of length ``dt`` in which nodes without contact would move to ``free_to (n,)`` (collective)."""
+        self.free_to = free_to
+        factor = np.where(self._mass > 0.0, self._mass, 1.0) / dt**2
+        if np.array_equal(factor, self._factor):
+            return
+        self._factor = factor
+        diagonal = self.unknowns.vector()
+        diagonal.array[:] = factor
+        self.tangent.K.setDiagonal(diagonal)
+        self.tangent.K.assemble()
+        self.stiffness = self.stiffness_at_start = factor.reshape(-1, self.config.gdim)
+
+    def assemble(self) -> bool:
+        """Inertia forces on the way from the freely moved state; whether they are finite on all ranks (collective)."""
+        self._b.array[:] = self._factor * (self._u.array_r - self.free_to)
+        return bool(np.isfinite(self._b.norm()))
+
+    def update_tangent(self) -> PETSc.Mat:
+        """M over the square of the step."""
+        return self.tangent.K
+
+
+class StepperWithMass(ExplicitStepper):
+    """Explicit steps of a problem whose contactors have mass; other arguments and methods as for ``ExplicitStepper``.
+
+    Raises:
+        MassError: if a free component has no mass.
+    """
+
+    def __init__(self, problem: Any):
+        super().__init__(problem)
+        bare = problem.comm.allreduce(int((~self.moving & ~self.dynamics.held).sum()))
+        if bare:
+            raise MassError(
+                f"{bare} free components have no mass, which CentralDifferences with contactors='massy' cannot move: give all bodies "
+                "a density, or take contactors='massless'"
+            )
+        self.bodies = InertBodies(problem.bodies, self._mass)
+        solver = solver_of(problem.config, "uem_masses_", OPTIONS)
+        self.system = BodySystem(self.bodies, problem.interfaces, solver, consistent_tangent=False)
+
+    def begin(self) -> None:
+        """Find the first accelerations (collective)."""
+        self.dynamics.begin(1.0)
+        a = self._accelerations()
+        self.dynamics.restore()
+        self.problem.keep()
+        self.dynamics.change_rates(np.array(self.dynamics.velocity.x.array[: self._n]), a)
+        self.dynamics.accelerated = True
+
+    def step(self, dt: float) -> Any:
+        """Take a step of length ``dt`` and commit it; returns the history of iterations for contact (collective)."""
+        problem, dynamics, bodies, n = self.problem, self.dynamics, self.bodies, self._n
+        half = dynamics.velocity.x.array[:n] + 0.5 * dt * dynamics.acceleration.x.array[:n]
+        begin = problem.committed[:n]
+        free_to = np.array(problem.committed)
+        free_to[:n] += dt * half
+        compat.set_bc_values(free_to, bodies.bcs)
+        bodies.wanted[:] = bodies.of_owners(free_to)
+        dynamics.begin(dt)
+        try:
+            bodies.begin(dt, free_to[:n])
+            bodies.u.x.array[:] = free_to
+            bodies.u.x.scatter_forward()
+            history = self._settle()
+        except UEMError:
+            problem.restore()
+            raise
+        a = self._accelerations()
+        half = (problem.u.x.array[:n] - begin) / dt
+        problem.commit()
+        dynamics.change_rates(np.where(self.moving, half + 0.5 * dt * a, dynamics.velocity.x.array[:n]), a)
+        return history
+
+    def _settle(self) -> Any:
+        """Correct the freely moved state by contact (collective)."""
+        problem = self.problem
+        for pair in problem.interfaces:
+            check_moved(pair)
+        self.system.begin_step()
+        self.system.place()
+        history = solve_united(
+            self.bodies,
+            self.system,
+            rtol=problem.rtol,
+            max_iterations=problem.max_iterations,
+            line_search=problem.line_search,
+            verbose=problem.verbose,
+            forces_before=problem.largest_forces,
+            check_signals=lambda: problem.progress.check_signals(problem.comm),
+        )
+        self.system.end_step()
+        refuse_passages(problem.config, problem.interfaces, problem.committed, problem.motions, moving=True)
+        return history
+
+    def _accelerations(self) -> Array:
+        """Accelerations of the moving components under the forces of the bodies, zero elsewhere ``(n,)`` (collective)."""
+        bodies = self.problem.bodies
+        bodies.assemble()
+        return np.asarray(-self._inverse * bodies.residual.array_r)
+
+    def critical_step(self) -> float:
+        """Longest stable step in the present state, infinite without stiffness (collective)."""
+        problem = self.problem
+        problem.bodies.restore()
+        problem.bodies.update_tangent()
+        highest = self._highest(self._stiffness_if_fixed)
+        return float(2.0 / np.sqrt(highest)) if highest > 0.0 else np.inf
