@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
-from uem_dolfinx.dynamics.explicit.with_mass import StepperWithMass
 from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import gathered
@@ -32,7 +31,12 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         InputError: if ``dt`` exceeds the critical step.
     """
     control, dynamics = problem.step_control, problem.dynamics
-    stepper = (ExplicitStepper if dynamics.contactors == "massless" else StepperWithMass)(problem)
+    kind: type[ExplicitStepper] = ExplicitStepper
+    if dynamics.contactors == "massy":
+        from uem_dolfinx.solve.steps.explicit_masses import StepperWithMass
+
+        kind = StepperWithMass
+    stepper = kind(problem)
     resumed = dt is None and dynamics.resumed and dynamics.time > dynamics.start
     problem.set_load(dynamics.time)
     if not dynamics.accelerated:
