@@ -210,3 +210,32 @@ def test_refused():
     J = u[0] * uem.ds(right)
     for m in (c, w):
         refused(uem.InputError, "no derivative", lambda m=m: uem.gradient(problem, J, [m]))
+
+
+def test_gradients_of_histories():
+    """Derivatives of a history with such values, friction among it, against differences."""
+    s, V, (left, right, bottom, top) = square(n=4)
+    E, k = fem.Constant(s.mesh, 10.0), fem.Constant(s.mesh, 3.0)
+
+    def run(record):
+        u = fem.Function(V)
+        F = linear(u, E) + k * u[0] * ufl.TestFunction(V)[0] * uem.ds(right)
+        bcs = [uem.dirichlet(V, top, None, lambda x, s: [0.05 * s**2 * x[0], -0.1 * s + 0 * x[0]])]
+        bcs.append(uem.dirichlet(V, left, 0, lambda x: 0.01 * x[1]))
+        floor = uem.Contact(bottom, uem.RigidPlane((0.0, 0.0), (0.0, 1.0)), friction=0.2)
+        problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[floor], rtol=1e-11)
+        J = ufl.inner(u, u) * ufl.dx + u[0] * uem.ds(right)
+        if not record:
+            list(uem.load_steps(problem, 4))
+            return uem.integrate(J)
+        with uem.recording(problem) as history:
+            list(uem.load_steps(problem, 4))
+        return history.gradient(J, [E, k])
+
+    for c, found in zip((E, k), run(True)):
+        value, ends = float(c.value), []
+        for change in (1e-4, -1e-4):
+            c.value = value * (1 + change)
+            ends.append(run(False))
+        c.value = value
+        assert float(found) == pytest.approx((ends[0] - ends[1]) / (2e-4 * value), rel=1e-6)
