@@ -36,9 +36,9 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 __version__ = "0.2.0"
 
 __all__ = [
-    "Adaptation", "Balance", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive", "Conductance",
-    "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies", "EnergyBook",
-    "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError",
+    "Adaptation", "Adhesion", "Balance", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
+    "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies",
+    "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError",
     "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic",
     "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton",
     "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad",
@@ -120,6 +120,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+    from uem_dolfinx.contact.laws.adhesion import Adhesion
     from uem_dolfinx.contact.laws.cohesive import Cohesive
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.exponential import Exponential
@@ -162,6 +163,7 @@ if _TYPE_CHECKING:
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "SoftContact": "contact.laws.soft",
     "Exponential": "contact.laws.exponential", "PowerLaw": "contact.laws.power_law",
+    "Adhesion": "contact.laws.adhesion",
     "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.mixed_mode", "Power": "contact.laws.mixed_mode",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
     "CentralDifferences": "dynamics.explicit.central_differences",

@@ -45,6 +45,7 @@ from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.laws.adhesion import Adhesion
     from uem_dolfinx.contact.laws.cohesive import Cohesive
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.mortar.discretisation import Mortar
@@ -100,7 +101,8 @@ class Contact(WatchedContact, given.Sealed):
             gap, and ``adjust`` is the reach of the tie, by default True.
         normal: None is hard contact; a ``SoftContact`` makes the pressure a function of the gap, without friction, wear, heat and tie.
         cohesion: a ``Cohesive`` bonds the contactors that ``adjust`` reaches, as a tie, until they separate. Its results are
-            :attr:`damage`, and :attr:`pressure` and :attr:`traction` with the bonds. Friction acts on the damaged part.
+            :attr:`damage`, and :attr:`pressure` and :attr:`traction` with the bonds. Friction acts on the damaged part. An
+            ``Adhesion`` attracts whatever faces each other.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -111,7 +113,7 @@ class Contact(WatchedContact, given.Sealed):
     """
 
     SETTABLE = dict.fromkeys(("friction", "offset"))
-    cohesion: Cohesive | None = None
+    cohesion: Cohesive | Adhesion | None = None
     #: Whether it is part of a general contact.
     of_all_surfaces = False
 
@@ -133,7 +135,7 @@ class Contact(WatchedContact, given.Sealed):
         wear: Field = 0.0,
         heat: Conductance | Sequence[Conductance] | None = None,
         normal: SoftContact | None = None,
-        cohesion: Cohesive | None = None,
+        cohesion: Cohesive | Adhesion | None = None,
         measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
     ):
@@ -351,7 +353,7 @@ class Contact(WatchedContact, given.Sealed):
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
         tie, kind = self._tie(nodes, discretisation, means, **of), kind_of_interface(self)
         self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
-        if self.tied is True or self.cohesion is not None:
+        if tie is not None and self.tied != "after":
             self._pair.project()
             self._pair.unite()
         if self.adjust and self.tied is not True:
@@ -379,7 +381,7 @@ class Contact(WatchedContact, given.Sealed):
 
             surface = TargetFacets(config, self.contactor, "contactor")
             warn_of_slim_tips(config, self.name, surface)
-            tied = (self.tied or self.cohesion is not None) and target.n_nodes
+            tied = (self.tied or getattr(self.cohesion, "bonds", False)) and target.n_nodes
             means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"})) if tied else None
             return Mortar(config, nodes, target, surface=surface, **how), means
         from uem_dolfinx.contact.nodes.bernstein import Bernstein

@@ -86,6 +86,9 @@ class Cohesive(given.Sealed):
             a viscosity with plastic unloading.
     """
 
+    #: Whether surfaces are bonded point to point.
+    bonds = True
+
     def __init__(
         self,
         strength: float,

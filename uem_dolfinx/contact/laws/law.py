@@ -123,10 +123,10 @@ def given_cohesion(cohesion: Any, sliding: str, normal: Any, friction: Any, wear
 
     Raises:
         InputTypeError: for another type.
-        InputError: for cohesion with a soft contact, friction by temperature, wear, heat or a tie; for plastic unloading with
-            ``sliding = "finite"``, as permanent openings do not turn with the bodies.
+        InputError: for cohesion with a soft contact, friction by temperature, wear, heat or a tie; adhesion with friction; plastic
+            unloading with ``sliding = "finite"``, as permanent openings do not turn with the bodies.
     """
-    given.kind("cohesion", cohesion, cohesion is None or hasattr(cohesion, "respond"), "a Cohesive, or None")
+    given.kind("cohesion", cohesion, cohesion is None or hasattr(cohesion, "bonds"), "a Cohesive, an Adhesion, or None")
     hot = isinstance(as_law(friction).field, OfTemperature)
     others = (
         ("normal", normal),
@@ -138,6 +138,8 @@ def given_cohesion(cohesion: Any, sliding: str, normal: Any, friction: Any, wear
     for what, there in others:
         if cohesion is not None and there:
             raise InputError(f"{what} does not go with cohesion: leave it out")
+    if cohesion is not None and not cohesion.bonds and (isinstance(friction, dict) or as_law(friction).field != 0.0):
+        raise InputError(f"friction does not go with cohesion = {cohesion!r}: leave it out")
     if getattr(cohesion, "unloading", None) == "plastic" and sliding == "finite":
         raise InputError("unloading = 'plastic' does not go with sliding = 'finite': take 'small' or 'fixed'")
     return cohesion

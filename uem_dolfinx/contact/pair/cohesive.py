@@ -128,7 +128,7 @@ class CohesiveInterface(Interface):
             return own
         nodes, blocks = self._bonds.stiffness(self._tangent)
         bonds = nodes, blocks, np.zeros(blocks.shape[:2])
-        return bonds if own is None else _together(own, bonds)
+        return bonds if own is None else together(own, bonds)
 
     def displaced(self) -> float:
         """See ``Told``."""
@@ -181,7 +181,7 @@ class CohesiveInterface(Interface):
             self.friction.set(self.friction.limits.law, self._rubbing(self._mu))
 
 
-def _together(a: tuple[Ints, Array, Array], b: tuple[Ints, Array, Array]) -> tuple[Ints, Array, Array]:
+def together(a: tuple[Ints, Array, Array], b: tuple[Ints, Array, Array]) -> tuple[Ints, Array, Array]:
     """Terms of two lists of contactors in one, of the wider blocks."""
     (k, m), (n, o) = a[0].shape, b[0].shape
     nodes, g = np.full((k + n, max(m, o)), -1, dtype=np.int64), (a[2].shape[1] // m if m else b[2].shape[1] // max(o, 1))

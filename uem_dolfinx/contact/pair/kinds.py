@@ -20,9 +20,9 @@ def kind_of_interface(contact: Any) -> Callable[..., Interface]:
 
         return soft.interface_of(contact.normal, contact)
     if contact.cohesion is not None:
-        from uem_dolfinx.contact.pair import cohesive
+        from uem_dolfinx.contact.pair import adhesive, cohesive
 
-        return cohesive.interface_of(contact.cohesion, contact)
+        return (cohesive if contact.cohesion.bonds else adhesive).interface_of(contact.cohesion, contact)
     return Interface
 
 
@@ -30,7 +30,7 @@ def tie_of(contact: Any, nodes: Indices, discretisation: Discretisation, means: 
     """Permanent tie, or bonds, of a contact; ``means`` as in ``Tie``. None without."""
     reach = None if isinstance(contact.adjust, bool) else contact.adjust
     how: dict[str, Any] = {"means": means, "reach": reach, **of}
-    if contact.cohesion is not None:
+    if contact.cohesion is not None and contact.cohesion.bonds:
         from uem_dolfinx.contact.ties import bonds
 
         return bonds.Bonds(contact.config, nodes, discretisation, **how)

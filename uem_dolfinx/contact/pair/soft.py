@@ -49,6 +49,14 @@ def interface_of(law: SoftContact, contact: Any) -> Callable[..., Interface]:
     return partial(SoftInterface, law=law, contact=contact)
 
 
+def stiffness_of_gaps(pair: Interface, stiffness: Array) -> tuple[Ints, Ints, Array]:
+    """Global rows of the gaps with a ``stiffness (n,)``, their contactors, and gradients there, see ``dyads.grouped``."""
+    eq = pair.kinematics.gap_rows.equations
+    row, node = np.append(np.arange(len(eq)), eq.row), np.append(pair.config.to_global(eq.node), eq.followed)
+    gradient = Terms(row, node, np.concatenate([eq.direction, -eq.coefficients]))
+    return grouped(np.append(stiffness, np.zeros(len(eq) - len(stiffness))), gradient, gradient)[:3]
+
+
 class _Edges:
     """In place of ``ConcaveEdges``: facets press alone, also in corners; contactors that alternate between them get averaged normals."""
 
@@ -195,10 +203,7 @@ class SoftInterface(Interface):
         """Stiffness of the gaps, and their forces by what is left between the gaps and those of the law; see ``Interface``."""
         if not self._acts:
             return None
-        eq = self.kinematics.gap_rows.equations
-        row, node = np.append(np.arange(len(eq)), eq.row), np.append(self.config.to_global(eq.node), eq.followed)
-        gradient = Terms(row, node, np.concatenate([eq.direction, -eq.coefficients]))
-        nodes, which, v, _ = grouped(self._stiffness, gradient, gradient)
+        nodes, which, v = stiffness_of_gaps(self, self._stiffness)
         k, left = self._stiffness[which], (self._force * (self.gaps() - self._at))[which]
         return nodes, k[:, None, None] * v[:, :, None] * v[:, None, :], (k * left)[:, None] * v
 

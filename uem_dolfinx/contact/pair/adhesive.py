@@ -1,0 +1,127 @@
+"""The interface of a contact with adhesion: hard contact, and an attraction by the present gaps beside it.
+
+With the gap g_i, its gradient r_i and the area A_i, the residual is ``F + sum_i A_i r_i a(g_i)``, and its derivative has the terms
+``sum_i A_i a'(g_i) r_i r_i'``, which soften, and the curvature ``sum_i A_i a(g_i) grad^2 g_i``. The multipliers of contact are what is
+pressed beyond the attraction; results are the sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.laws.adhesion import Adhesion
+from uem_dolfinx.contact.pair.cohesive import MOST_EXCHANGED, together
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.soft import stiffness_of_gaps
+from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.contact.seam.placement import Traction
+from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.errors import InputError
+
+
+def interface_of(law: Adhesion, contact: Any) -> Callable[..., Interface]:
+    """Class of a contact's interface; InputError for a law of points, which have no areas."""
+    if contact.contactor.dim == 0:
+        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
+    return partial(AdhesiveInterface, law=law, contact=contact)
+
+
+class AdhesiveInterface(Interface):
+    """Contactors that are attracted by their target; other arguments as for ``Interface``.
+
+    Args:
+        law: attraction by the gap.
+        contact: that it belongs to, for ``measured_areas`` and ``leads``.
+    """
+
+    #: Its forces store and release energy.
+    works = True
+
+    def __init__(self, *args: Any, law: Adhesion, contact: Any, **how: Any):
+        super().__init__(*args, **how)
+        self._law, self._contact, n = law, contact, len(self.nodes)
+        # marks that forces follow a law; there is no damage
+        self.trial = self.committed = replace(self.committed, cohesion=np.zeros((n, 2)))
+        #: Multipliers of the rows of gaps, negative in attraction, and stiffnesses ``(n,)``.
+        self._pull = self._stiffness = np.zeros(n)
+        #: Exchanges since the last placement, and whether softening is left out of the derivative in this step.
+        self._exchanged, self._convex = 0, False
+
+    def _project(self) -> None:
+        super()._project()
+        if self.trial.cohesion is None or not self.asked:
+            self._pull = self._stiffness = np.zeros(len(self.nodes))
+            return
+        share = self.kinematics.pressure_map(False).force
+        a, slope = self._law.attraction(self.kinematics.gap_rows.equations.gap[: len(share)] / share)
+        area = np.where(self.off | ~self._contact.leads(), 0.0, self._contact.measured_areas())
+        self._pull, self._stiffness = -area * a / share, area * (0.0 if self._convex else slope) / share**2
+        self._exchanged = 0
+
+    def exchange(self, violated: Violations) -> None:
+        """See ``Interface``; where exchanges do not end, softening has made the problem indefinite, and is left out in this step."""
+        super().exchange(violated)
+        self._exchanged += 1
+        if self._exchanged == MOST_EXCHANGED:
+            self._convex, self._stiffness = True, 0.0 * self._stiffness
+
+    def restore(self) -> None:
+        """See ``Interface``."""
+        super().restore()
+        self._convex = False
+
+    def _pulled(self) -> Array:
+        """Forces of attraction on the contactors ``(n, gdim)`` (collective)."""
+        return np.asarray(self.config.add_at_owners(*self.kinematics.gap_rows.forces(self._all()))[self.nodes])
+
+    def _all(self) -> Array:
+        """Multipliers of attraction of all rows, of corners' further axes too ``(m,)``."""
+        rows = self.kinematics.gap_rows
+        return np.append(self._pull, np.zeros(len(rows.equations) - len(self._pull)))
+
+    def applied_forces(self) -> tuple[Ints, Array] | None:
+        """The attraction, as loads of both bodies."""
+        return self.kinematics.gap_rows.forces(self._all()) if self.trial.cohesion is not None else None
+
+    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+        """Terms of friction, and the stiffness of the attraction; see ``Interface``."""
+        own = super().slip_terms()
+        nodes, which, v = stiffness_of_gaps(self, self._stiffness)
+        blocks = self._stiffness[which, None, None] * v[:, :, None] * v[:, None, :]
+        pull = nodes, blocks, np.zeros(v.shape)
+        return pull if own is None else together(own, pull)
+
+    def curvature(self) -> list[tuple[Ints, Array]]:
+        """See ``Interface``; the attraction bends as the contact forces do (collective)."""
+        state, share = self.trial, self.kinematics.pressure_map(False).force
+        none, lam = np.zeros(len(share), dtype=bool), self._pull * share
+        pulled = replace(state, active=none, lam=lam, nodal=lam, force=0.0 * state.force, held=np.full_like(state.held, -1))
+        return super().curvature() + self.kinematics.curvature(pulled)
+
+    # -- results ---------------------------------------------------------------------------------------------------------
+
+    def with_forces(self, found: Traction) -> PairState:
+        """See ``Interface``; forces on the contactors contain the attraction (collective)."""
+        return super().with_forces(found._replace(force=found.force + self._pulled()))
+
+    def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
+        """See ``Interface`` (collective)."""
+        nodes, forces = super().nodal_forces(replace(state, force=state.force - self._pulled()))
+        more = self.kinematics.gap_rows.forces(self._all())
+        return np.concatenate([nodes, more[0]]), np.concatenate([forces, more[1]])
+
+    def pressing(self) -> tuple[Array, Array]:
+        """See ``Told``; contact and attraction."""
+        lam, tau = super().pressing()
+        return lam + self._pull * self.kinematics.pressure_map(False).force, tau
+
+    @property
+    def united(self) -> Bools:
+        """Contactors that touch ``(n,)``."""
+        return self.trial.active
