@@ -164,6 +164,8 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
         lines = contact.sliding != "finite" or highest(config.comm, np.abs(contact.force.x.array)) <= rounding
         assert balance is None or (balance.force < 1e-11 and (balance.moment < lever(contact) or lines))
         left -= contact.force.x.array.reshape(-1, config.gdim)[:n]
+        if getattr(contact, "leak", None) is not None:
+            left -= config.add_at_owners(*contact.pair.applied_forces())
     if problem.linear is not None:
         left -= problem.linear.forces(problem.linear.multipliers)
     assert highest(config.comm, np.abs(left * bodies.free[:n])) <= 1e-5 * scale + rounding

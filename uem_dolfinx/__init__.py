@@ -39,7 +39,7 @@ __all__ = [
     "Adaptation", "Adhesion", "Balance", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
     "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies",
     "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError",
-    "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "LinearElastic",
+    "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "Leak", "LinearElastic",
     "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton",
     "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad",
     "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results", "ResultsWriter", "RigidCoupling",
@@ -124,6 +124,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.cohesive import Cohesive
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.exponential import Exponential
+    from uem_dolfinx.contact.laws.leak import Leak
     from uem_dolfinx.contact.laws.mixed_mode import BenzeggaghKenane, Power
     from uem_dolfinx.contact.laws.power_law import PowerLaw
     from uem_dolfinx.contact.laws.soft import SoftContact
@@ -164,6 +165,7 @@ _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "SoftContact": "contact.laws.soft",
     "Exponential": "contact.laws.exponential", "PowerLaw": "contact.laws.power_law",
     "Adhesion": "contact.laws.adhesion",
+    "Leak": "contact.laws.leak",
     "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.mixed_mode", "Power": "contact.laws.mixed_mode",
     "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
     "CentralDifferences": "dynamics.explicit.central_differences",

@@ -17,11 +17,10 @@ from uem_dolfinx.contact.laws.law import (
     Field,
     FrictionLaw,
     as_law,
-    check_tied,
     follows_load,
-    given_cohesion,
     given_field,
     given_friction,
+    given_joint,
     given_normal,
     of_rate,
     parameters,
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
     from uem_dolfinx.contact.laws.adhesion import Adhesion
     from uem_dolfinx.contact.laws.cohesive import Cohesive
+    from uem_dolfinx.contact.laws.leak import Leak
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
@@ -103,6 +103,7 @@ class Contact(WatchedContact, given.Sealed):
         cohesion: a ``Cohesive`` bonds the contactors that ``adjust`` reaches, as a tie, until they separate. Its results are
             :attr:`damage`, and :attr:`pressure` and :attr:`traction` with the bonds. Friction acts on the damaged part. An
             ``Adhesion`` attracts whatever faces each other.
+        leak: a ``Leak`` lets a fluid enter between the surfaces from one side, which presses on both.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -114,6 +115,7 @@ class Contact(WatchedContact, given.Sealed):
 
     SETTABLE = dict.fromkeys(("friction", "offset"))
     cohesion: Cohesive | Adhesion | None = None
+    leak: Leak | None = None
     #: Whether it is part of a general contact.
     of_all_surfaces = False
 
@@ -136,6 +138,7 @@ class Contact(WatchedContact, given.Sealed):
         heat: Conductance | Sequence[Conductance] | None = None,
         normal: SoftContact | None = None,
         cohesion: Cohesive | Adhesion | None = None,
+        leak: Leak | None = None,
         measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
     ):
@@ -160,8 +163,7 @@ class Contact(WatchedContact, given.Sealed):
             if not isinstance(adjust, (bool, np.bool_)):
                 adjust = given.number("adjust", adjust, REACH)
             self._offset = given_field("offset", offset)
-            check_tied(tied, offset, wear, friction)
-            self.cohesion = given_cohesion(cohesion, sliding, normal, friction, wear, self.heats, tied)
+            self.cohesion, self.leak = given_joint(cohesion, leak, sliding, normal, friction, wear, self.heats, tied, offset)
             if coupling == "mortar" and (chords or normals != "facet"):
                 what = "chords = True" if chords else f"normals = '{normals}'"
                 raise InputError(
@@ -311,7 +313,7 @@ class Contact(WatchedContact, given.Sealed):
     def words(self) -> dict[str, str]:
         """Settings of tie and normal contact, which must be equal when a checkpoint is resumed."""
         words = {"tied and adjust": f"{self.tied}, {self.adjust}"} if self.tied or self.adjust else {}
-        laws = {"normal": self.normal, "cohesion": self.cohesion}
+        laws = {"normal": self.normal, "cohesion": self.cohesion, "leak": self.leak}
         return words | {name: repr(law) for name, law in laws.items() if law is not None}
 
     def attach(
@@ -341,7 +343,7 @@ class Contact(WatchedContact, given.Sealed):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear, normal=repr(self.normal), cohesion=repr(self.cohesion),
+            wear=self._wear, normal=repr(self.normal), cohesion=repr(self.cohesion), leak=repr(self.leak),
             heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")

@@ -249,11 +249,8 @@ class ContactResults:
         With friction, a contactor held in a 2D corner of the target sticks.
         """
         state = self.pair.trial
-        sticks = (
-            np.zeros(len(state.active), bool)
-            if state.friction is None
-            else state.friction.stick | (state.in_corner & (self.config.gdim == 2))
-        )
+        cornered = state.in_corner & (self.config.gdim == 2)
+        sticks = np.zeros(len(cornered), bool) if state.friction is None else state.friction.stick | cornered
         return self._field("status", np.where(self.pair.united, np.where(sticks | self.pair.tied, 1.0, 2.0), 0.0))
 
     @property
@@ -282,6 +279,12 @@ class ContactResults:
         """Wear depth of the contactor after all committed steps, as a scalar field, a length (collective)."""
         friction = self.pair.committed.friction
         return self._field("wear", 0.0 if friction is None else friction.worn)
+
+    @property
+    def wet(self) -> fem.Function:
+        """1 where the fluid of ``leak`` reaches the contactor, else 0, as a scalar field (collective)."""
+        state = self.pair.trial.wet
+        return self._field("wet", np.zeros(len(self.nodes)) if state is None else state.astype(float))
 
     @property
     def damage(self) -> fem.Function:

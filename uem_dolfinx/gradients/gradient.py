@@ -189,6 +189,8 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             raise InputError("gradients do not support soft contact: expected normal = None, hard contact")
         if any(contact.cohesion is not None for contact in problem.contacts):
             raise InputError("gradients do not support cohesion: expected cohesion = None")
+        if any(contact.leak is not None for contact in problem.contacts):
+            raise InputError("gradients do not support a fluid between surfaces: expected leak = None")
         if chords := [contact.name for contact in problem.contacts if contact.chords]:
             raise InputError(
                 f"contact '{chords[0]}': there is no gradient with chords=True, whose rows are not the derivative of the gaps: expected "

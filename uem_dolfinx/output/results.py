@@ -376,6 +376,8 @@ def contact_fields(contact: Contact | GeneralContact) -> dict[str, fem.Function]
         found["wear"] = contact.wear
     if isinstance(contact, Contact) and contact.cohesion is not None:
         found["damage"] = contact.damage
+    if isinstance(contact, Contact) and contact.leak is not None:
+        found["wet"] = contact.wet
     for k, field in enumerate(dict.fromkeys(law.field for law in contact.heats)):
         found[f"heat_flux{f'_of_field_{field}' if k else ''}"] = contact.heat_flux_of(field)
     return found

@@ -145,6 +145,28 @@ def given_cohesion(cohesion: Any, sliding: str, normal: Any, friction: Any, wear
     return cohesion
 
 
+def given_leak(leak: Any, normal: Any, cohesion: Any, tied: Any) -> Any:
+    """Checked user input for the fluid of a contact: a ``Leak``, or None.
+
+    Raises:
+        InputTypeError: for another type.
+        InputError: for a fluid with a soft contact, cohesion or a tie.
+    """
+    given.kind("leak", leak, leak is None or hasattr(leak, "inlet"), "a Leak, or None")
+    for what, there in (("normal", normal), ("cohesion", cohesion), ("tied", tied)):
+        if leak is not None and there:
+            raise InputError(f"{what} does not go with leak: leave it out")
+    return leak
+
+
+def given_joint(
+    cohesion: Any, leak: Any, sliding: str, normal: Any, friction: Any, wear: Any, heats: Sequence[Any], tied: Any, offset: Any
+) -> tuple[Any, Any]:
+    """Checked user input for what is between the surfaces: cohesion and a fluid; see ``given_cohesion``, ``given_leak``, ``check_tied``."""
+    check_tied(tied, offset, wear, friction)
+    return given_cohesion(cohesion, sliding, normal, friction, wear, heats, tied), given_leak(leak, normal, cohesion, tied)
+
+
 def check_tied(tied: Any, offset: Any, wear: Any, friction: Any) -> None:
     """Refuse what does not go with ``tied = True``.
 

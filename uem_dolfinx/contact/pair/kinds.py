@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def kind_of_interface(contact: Any) -> Callable[..., Interface]:
-    """Class of a contact's interface: hard, soft or with cohesion."""
+    """Class of a contact's interface: hard, soft, with cohesion, or with a fluid."""
     if contact.normal is not None:
         from uem_dolfinx.contact.pair import soft
 
@@ -23,6 +23,10 @@ def kind_of_interface(contact: Any) -> Callable[..., Interface]:
         from uem_dolfinx.contact.pair import adhesive, cohesive
 
         return (cohesive if contact.cohesion.bonds else adhesive).interface_of(contact.cohesion, contact)
+    if contact.leak is not None:
+        from uem_dolfinx.contact.pair import leaking
+
+        return leaking.interface_of(contact.leak, contact)
     return Interface
 
 

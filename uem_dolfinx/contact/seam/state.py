@@ -90,6 +90,7 @@ class PairState:
             and while it is switched off.
         cohesion: damage, delayed damage, load factor or time of these, permanent opening and normal of bonds ``(n, 3 + 2 gdim)``; None
             without cohesion.
+        wet: whether a fluid between the surfaces reaches the contactor ``(n,)``; None without fluid.
     """
 
     active: Bools
@@ -108,6 +109,7 @@ class PairState:
     heat: Array | None = None
     law_gap: Array | None = None
     cohesion: Array | None = None
+    wet: Bools | None = None
 
     @property
     def has_law(self) -> bool:
@@ -143,7 +145,7 @@ class PairState:
             keys_of: function from facet numbers to keys independent of the partition ``(k,)``.
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
-        for name in ("bond", "heat", "law_gap", "cohesion"):
+        for name in ("bond", "heat", "law_gap", "cohesion", "wet"):
             if getattr(self, name) is None:
                 del kept[name]
         if self.heat is not None and self.heat.shape[1] == 1:

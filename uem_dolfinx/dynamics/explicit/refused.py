@@ -49,6 +49,6 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
             raise InputError(f"{name} is tied, and its nodes have mass, which CentralDifferences move freely: {remedy}")
         if getattr(contact, "heats", ()):
             raise InputError(f"{name} conducts heat, which does not go with CentralDifferences: {remedy}")
-        for what in ("normal", "cohesion"):
+        for what in ("normal", "cohesion", "leak"):
             if law := getattr(contact, what, None):
                 raise InputError(f"{name} has {what} = {law!r}, which does not go with CentralDifferences: {remedy}")
