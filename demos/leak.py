@@ -14,7 +14,8 @@ Options:
 # preload q. A fluid of pressure p stands on both sides of the joint. It enters where the joint is open and connected with a side.
 #
 # With the heights h of the flanges the contact pressure is $q / (1 + 2 h k / E)$ as long as the joint is closed. A fluid of a lower
-# pressure reaches the outermost contactors only. At a higher pressure it runs through the joint and lifts the upper flange, until bolts balance it:
+# pressure reaches the outermost contactors only. At a higher pressure it runs through the joint and lifts the upper flange, until
+# bolts balance it:
 #
 # $$
 # p > \frac{q}{1 + 2 h k / E}: \qquad \text{opening} = \frac{p - q}{k} + \frac{2 h p}{E}.
