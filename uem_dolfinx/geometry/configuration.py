@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property
 from typing import Any
 from weakref import WeakValueDictionary
-
-from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
@@ -153,16 +150,9 @@ class Configuration(Nodes):
         """Forces, momenta or positions of nodes ``(..., gdim)``, integrated over circles in axisymmetry: radial parts cancel."""
         return vectors * np.array([0.0, 1.0]) if self.axisymmetric else vectors
 
-    @cached_property
-    def size(self) -> float:
-        """Diagonal of the reference bounding box of the whole model, the length that tolerances scale with (first call: collective)."""
-        bounds = np.concatenate([np.max(sign * self.X, axis=0, initial=-np.inf) for sign in (-1.0, 1.0)])
-        self.comm.Allreduce(MPI.IN_PLACE, bounds, op=MPI.MAX)
-        return float(np.linalg.norm(bounds[self.gdim :] + bounds[: self.gdim]))
-
 
 def configuration_of(V: Any) -> Configuration:
-    """Nodes of a displacement space; InputTypeError or SpaceError for other spaces."""
+    """Nodes of a displacement space (collective); InputTypeError or SpaceError for other spaces."""
     given.kind("V", V, isinstance(V, fem.FunctionSpace), "a function space", "as u.function_space")
     if len(V.component()):
         raise SpaceError("V is a part of another space: expected a whole one; collapse it, or make it by uem.function_space")

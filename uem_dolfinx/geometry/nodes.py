@@ -33,6 +33,7 @@ class Nodes:
         first: global number of the first owned node.
         n_global: global numbers of all ranks' nodes are below it.
         X: reference positions of the local nodes ``(n_local, gdim)``, ghosts included.
+        size: diagonal of the reference bounding box of the whole model, the length that tolerances scale with.
 
     Raises:
         MeshError: if a node's position is not finite.
@@ -51,6 +52,9 @@ class Nodes:
         every = np.arange(self.n_local)
         self.first, self.n_global = int(self.index_map.local_range[0]), int(self.index_map.size_global)
         self.X: Array = self.from_owners(every, V.tabulate_dof_coordinates()[: self.n_local, : self.gdim], every)
+        bounds = np.concatenate([np.max(sign * self.X, axis=0, initial=-np.inf) for sign in (-1.0, 1.0)])
+        self.comm.Allreduce(MPI.IN_PLACE, bounds, op=MPI.MAX)
+        self.size = float(np.linalg.norm(bounds[self.gdim :] + bounds[: self.gdim]))
 
     def modes(self, centred: bool = False) -> Array:
         """Zero-energy fields at the owned nodes: a constant of each component ``(n_owned, n_modes, block)``.
