@@ -292,7 +292,6 @@ def test_it_goes_on_from_a_checkpoint(tmp_path):
 
 REFUSED = {
     "a consistent mass": ({"consistent": True}, "lumped mass"),
-    "damping": ({"dynamics": {"damping": lambda rate: ufl.inner(rate, rate) * ufl.dx}}, "damping does not go"),
     "a tie": ({"contact": {"tied": True}}, "is tied"),
     "a general contact": ({"general": True}, "GeneralContact"),
     "events": ({"steps": {"event_tolerance": 0.1}}, "event_tolerance"),

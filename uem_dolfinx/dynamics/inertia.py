@@ -305,12 +305,12 @@ class Dynamics(given.Sealed):
         return tuple(float(np.sqrt(max(part.dot(self.mass.M * part), 0.0))) for part in (error, v))  # type: ignore[return-value]
 
     @contextmanager
-    def without_inertia(self) -> Iterator[None]:
-        """Context in which the tangent has no mass and no damping."""
+    def without_inertia(self, damping: float = 0.0) -> Iterator[None]:
+        """Context in which the tangent has no mass, and ``damping`` times that of the damping form by the velocity."""
         rate = None if self.damping is None else float(self._rate.value)
         factor, self.factor = self.factor, 0.0
         if rate is not None:
-            self._rate.value = 0.0
+            self._rate.value = damping
         try:
             yield
         finally:

@@ -27,6 +27,8 @@ class CentralDifferences:
     the surface's own mass are then plastic, general contact and thin walls go as well. Source: Doyen,
     Ern, Piperno, SIAM J. Sci. Comput. 33 (2011) 223-249, https://doi.org/10.1137/100791440.
 
+    Damping forms are those of the velocity in the middle of the step.
+
     Args:
         safety: steps that ``time_steps`` chooses are this part of the critical one, between 0 and 1.
 

@@ -32,8 +32,6 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
     for name, value in others.items():
         if value:
             raise InputError(f"{name} does not go with CentralDifferences: {remedy}")
-    if dynamics.damping is not None:
-        raise InputError(f"damping does not go with CentralDifferences, whose steps it would shorten: {remedy}")
     if not dynamics.mass.diagonal:
         raise InputError(
             "CentralDifferences divide forces by masses: expected a lumped mass; make it by uem.lumped_mass(V, density)"

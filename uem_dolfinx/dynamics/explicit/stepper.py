@@ -101,12 +101,28 @@ class ExplicitStepper:
     def critical_step(self) -> float:
         """Longest stable step in the present state, infinite without stiffness (collective).
 
+        With the largest eigenvalues k and c of stiffness and damping over mass it is ``2 / r`` of ``r^2 = k + r c``, since damping forces
+        are those of the velocity in the middle of the step before.
+        """
+        # committed stresses are on the yield surface, from where the tangent is elastic, as it is in unloading
+        self.problem.bodies.restore()
+        with self.dynamics.without_inertia():
+            k = self._highest_square()
+        if k <= 0.0:
+            return np.inf
+        c = 0.0
+        if self.dynamics.damping is not None:
+            with self.dynamics.without_inertia(np.sqrt(k)):
+                c = max(self._highest_square() - k, 0.0) / np.sqrt(k)
+        return float(4.0 / (c + np.sqrt(c**2 + 4.0 * k)))
+
+    def _highest_square(self) -> float:
+        """Square of the highest frequency by the present tangent (collective).
+
         The surface follows the masses in equilibrium: its stiffness alone does not count. If a surface at rest would hardly make the
         frequency higher, that bound is taken, which no contact exceeds; otherwise ``of_contact`` is set, as contacts change the step.
         """
         problem = self.problem
-        # committed stresses are on the yield surface, from where the tangent is elastic, as it is in unloading
-        problem.bodies.restore()
         problem.bodies.update_tangent()
         fixed = self._highest(self._stiffness_if_fixed)
         with problem.bodies.holding(self.interior):
@@ -116,8 +132,7 @@ class ExplicitStepper:
             system.solver.set_operator(self._P, problem.bodies.tangent.K, None, self._P)
             condensed = self._highest(self._stiffness)
         self.of_contact = fixed > STIFF_SURFACE * condensed
-        highest = condensed if self.of_contact else fixed
-        return 2.0 / np.sqrt(highest) if highest > 0.0 else np.inf
+        return condensed if self.of_contact else fixed
 
     def steps_to_check(self, dt: float) -> int:
         """Number of steps of length ``dt`` after which the critical step is found anew (collective)."""

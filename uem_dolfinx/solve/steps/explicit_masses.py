@@ -158,10 +158,7 @@ class StepperWithMass(ExplicitStepper):
         bodies.assemble()
         return np.asarray(-self._inverse * bodies.residual.array_r)
 
-    def critical_step(self) -> float:
-        """Longest stable step in the present state, infinite without stiffness (collective)."""
-        problem = self.problem
-        problem.bodies.restore()
-        problem.bodies.update_tangent()
-        highest = self._highest(self._stiffness_if_fixed)
-        return float(2.0 / np.sqrt(highest)) if highest > 0.0 else np.inf
+    def _highest_square(self) -> float:
+        """Square of the highest frequency by the present tangent (collective)."""
+        self.problem.bodies.update_tangent()
+        return self._highest(self._stiffness_if_fixed)
