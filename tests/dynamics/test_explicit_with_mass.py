@@ -98,6 +98,45 @@ def test_momentum_of_two_bars(how):
     assert abs(sums[0]) < 0.05 * LENGTH and abs(sums[1] + LENGTH) < 0.05 * LENGTH
 
 
+def disc(middle):
+    """A disc of radius 1 in 6 x 6 cells."""
+
+    def onto(x):
+        return np.column_stack([x[:, 0] * np.sqrt(1 - x[:, 1] ** 2 / 2), x[:, 1] * np.sqrt(1 - x[:, 0] ** 2 / 2)]) + middle
+
+    return box("quadrilateral", [-1.0, -1.0], [1.0, 1.0], [6, 6]).mapped(onto)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_discs_that_collide_off_centre(friction):
+    """Momentum stays to rounding, moment of momentum to the arc's facets, and energy is lost with the mass of a few nodes alone."""
+    s = scene(COMM, "quadrilateral", [disc((0.0, 0.0)), disc((0.3, 2.0))])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
+    velocity.x.array.reshape(-1, 2)[V.tabulate_dof_coordinates()[:, 1] > 1.0, 1] = -1.0
+    law = uem.StVenantKirchhoff(1e3, 0.3, kind="plane_strain")
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity, scheme=uem.CentralDifferences(), contactors="massy")
+    contact = uem.GeneralContact(friction=friction)
+    problem = uem.UnitedProblem(law.residual(u, v) * ufl.dx, u, contacts=[contact], dynamics=dynamics)
+    book, config = uem.EnergyBook(problem, law.energy(u) * ufl.dx), problem.config
+    m, own, spins = dynamics.mass.of_nodes, slice(config.n_owned), []
+
+    def spin():
+        p = m * dynamics.velocity.x.array.reshape(-1, 2)[own]
+        return reduced(COMM, float((config.x[own, 0] * p[:, 1] - config.x[own, 1] * p[:, 0]).sum()))
+
+    first, touched = spin(), 0
+    for step in uem.time_steps(problem, end=0.4):
+        book.write(step)
+        spins.append(spin())
+        touched = max(touched, contact.n_active)
+    momenta, last = np.array(book.momenta), book.rows[-1]
+    assert touched > 1 and contact.n_active == 0
+    assert np.abs(momenta - momenta[0]).max() < 1e-9 * abs(momenta[0, 1])
+    assert np.abs(np.array(spins) / first - 1.0).max() < 5e-3
+    assert 0.0 < 1.0 - (last.kinetic + last.stored) / book.rows[0].kinetic < 0.02
+
+
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_a_block_slides_to_rest(coupling):
     """Friction stops a block with mu g, in closed form, and holds it."""
