@@ -20,7 +20,10 @@ LENGTH, C = 1.0, 1.0
 
 
 class Bar:
-    """A bar of density and wave speed 1, held at its lower end, that vibrates in its first mode; ``damping`` of a rate and a test function."""
+    """A bar of density and wave speed 1, held at its lower end, that vibrates in its first mode; or one that hits a wall.
+
+    ``damping`` is a function of the rate and the test function.
+    """
 
     def __init__(self, damping=None, cells=20, contactors="massless", speed=0.01, wall=False):
         s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [0.1, LENGTH], [1, cells])])
