@@ -125,6 +125,20 @@ def test_a_closed_joint_cuts_the_fluid_off():
     assert 0.0 < uem.integrate(contact.wet * uem.ds(foot)) < 0.5
 
 
+def test_switched_off_and_on():
+    """Switched off, the contact has no fluid and the block rests on its springs alone; switched on, the fluid comes back."""
+    joint = Joint(lambda s: 1.5 * s, target="block", coupling="mortar")
+    off, on = {joint.contact: False}, {joint.contact: True}
+    lifts = []
+    for step in uem.load_steps(
+        joint.problem, [uem.Step("a", 4), uem.Step("off", 1, contacts=off), uem.Step("on", 4, contacts=on)]
+    ):
+        if step.factor == 1.0:
+            lifts.append((joint.lift, joint.wet))
+    opened = (1.5 - PRELOAD) / STIFFNESS, 1.0
+    assert np.allclose(lifts, [opened, (-PRELOAD / STIFFNESS, 0.0), opened], atol=1e-6)
+
+
 def test_restart(tmp_path):
     """A run that goes on from a checkpoint is the uninterrupted one."""
     path = COMM.bcast(str(tmp_path / "kept"))

@@ -93,8 +93,8 @@ class LeakingInterface(Interface):
     def follow(self) -> bool:
         """Let the fluid reach further contactors or leave them (collective); see ``Interface``."""
         moved = super().follow()
-        before = self.trial.wet
-        assert before is not None
+        # a contact that was switched off knows of no fluid
+        before = self._inlet if self.trial.wet is None else self.trial.wet
         wet = self._reached() | (before & (self._changes > MOST_REACHED))
         changed = wet != before
         self._changes = self._changes + changed
@@ -103,8 +103,8 @@ class LeakingInterface(Interface):
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """The fluid's forces by the rows of gaps, as loads of both bodies (collective)."""
-        own, wet = super().applied_forces(), self.trial.wet
-        if not self.asked or wet is None:
+        own, wet = super().applied_forces(), self._inlet if self.trial.wet is None else self.trial.wet
+        if not self.asked:
             return own
         p = self._law.at(self.config.comm, self.name, float(self._contact._at))
         if self._begun is None:
