@@ -103,6 +103,24 @@ def test_blocks_adhere_again(coupling):
         assert highest(COMM, np.abs(contact.pressures + 0.5 * way)) < 1e-6 and contact.balance().force < 1e-12
 
 
+def test_switched_off_and_on():
+    """A contact that was switched off attracts again as soon as it is switched on."""
+    b = blocks(COMM, "quadrilateral", 2, 3)
+    contact = uem.Contact(b.high, b.low, cohesion=uem.Adhesion(0.01, 1.0), coupling="mortar")
+    up = fem.Function(b.V)
+
+    def pull(s):
+        up.x.array[1::2] = 1e-3
+
+    bcs = [uem.dirichlet(b.V, b.bottom), uem.dirichlet(b.V, b.top, value=up)]
+    problem = uem.UnitedProblem(linear(b.u, 1e3, 0.0), b.u, bcs=bcs, contacts=[contact], petsc_options_prefix="adhesion_")
+    turns = [("a", True, 0.5), ("off", False, 0.0), ("on", True, 0.5)]
+    steps = [uem.Step(name, 1, loads=pull, contacts={contact: is_on}) for name, is_on, _ in turns]
+    for _, (_, is_on, wanted) in zip(uem.load_steps(problem, steps), turns, strict=True):
+        force = contact.resultant().force[1]
+        assert is_on == (force != 0.0) and abs(force) == pytest.approx(wanted, rel=0.1)
+
+
 def test_what_is_refused():
     """Friction does not go with adhesion; numbers must be positive."""
     b = blocks(COMM, "quadrilateral", 2, 3)

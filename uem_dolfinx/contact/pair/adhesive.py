@@ -53,6 +53,11 @@ class AdhesiveInterface(Interface):
         #: Exchanges since the last placement, and whether softening is left out of the derivative in this step.
         self._exchanged, self._convex = 0, False
 
+    def activate_touching(self) -> None:
+        """See ``Interface``; a contact that was switched off attracts again."""
+        self.trial = self.committed = replace(self.committed, cohesion=np.zeros((len(self.nodes), 2)))
+        super().activate_touching()
+
     def _project(self) -> None:
         super()._project()
         if self.trial.cohesion is None or not self.asked:
