@@ -112,10 +112,11 @@ def in_groups(navigation: str) -> str:
 
 
 def front(text: str) -> str:
-    """The site's first page with the script and the table of couplings of the README."""
+    """The site's first page with the script of the README and the table of couplings of their page."""
     readme = (DEMOS.parent / "README.md").read_text(encoding="utf-8")
     script = re.search(r"```python\n(.*?)```\n", readme, re.DOTALL)[1]
-    table = re.search(r"^\| \| node_to_surface \|.*?\n\n", readme, re.DOTALL | re.MULTILINE)[0]
+    couplings = (DEMOS / "site" / "howto" / "sides_and_coupling.md").read_text(encoding="utf-8")
+    table = re.search(r"^\| \| node_to_surface \|.*?\n\n", couplings, re.DOTALL | re.MULTILINE)[0]
     return text.replace("<!-- script -->", f"```python\n{fitting(script)}```").replace("<!-- couplings -->", table)
 
 
