@@ -26,7 +26,7 @@ from uem_dolfinx.errors import InputError
 #: [convention; the least stiffness; test_cohesive_laws.py::test_the_stiffness_before_damage]
 STIFFER = 100.0
 #: Length of a complex step, over the quantity: its square is below rounding.
-#: [derived; the quantity; test_cohesive_laws.py::test_the_tangent_is_the_derivative]
+#: [format; the quantity; -]
 COMPLEX_STEP = np.finfo(float).eps ** 2
 
 
