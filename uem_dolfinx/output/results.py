@@ -74,7 +74,7 @@ class HistoryWriter(Closing, given.Sealed):
     ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         until = problem.progress if resume else None
-        self.path, self.problem, dynamics = Path(path), problem, problem.dynamics
+        self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         names = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
         suffixes, resultant = contact_suffixes(problem.declared), [f"force_{a}" for a in axes] + [f"moment_{a}" for a in turns]
@@ -82,6 +82,7 @@ class HistoryWriter(Closing, given.Sealed):
             names += [f"{name}{suffix}" for name in ("active", "max_gap", *resultant)]
         self._progress, self._asked = problem.progress, Columns(problem, reaction, columns)
         self.table = CsvTable(path, problem.comm, names + self._asked.names, until, key="step", whose=self._whose)
+        self.path = Path(path)
         try:
             self._pairs = PairTables(self.table.path, problem, suffixes, names[0], resultant, resume)
         except Exception:
