@@ -7,9 +7,7 @@ pressed beyond the attraction; results are the sum.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,14 +20,6 @@ from uem_dolfinx.contact.pair.soft import stiffness_of_gaps
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.errors import InputError
-
-
-def interface_of(law: Adhesion, contact: Any) -> Callable[..., Interface]:
-    """Class of a contact's interface; InputError for a law of points, which have no areas."""
-    if contact.contactor.dim == 0:
-        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
-    return partial(AdhesiveInterface, law=law, contact=contact)
 
 
 class AdhesiveInterface(Interface):

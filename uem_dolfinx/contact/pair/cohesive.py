@@ -10,9 +10,7 @@ Damage is committed with the step. With friction, limits are those of the damage
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,6 @@ from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.ties.bonds import Bonds
-from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
 
 #: Bonds that have changed between growing, resting and broken damage so often in a step get the stiffness without growth, with which
@@ -37,13 +34,6 @@ MOST_EXCHANGED = 4
 #: Columns of the state: damage, delayed damage and the load factor or time that it belongs to; the permanent opening and the normal of
 #: the next step follow.
 DAMAGE, DELAYED, AT, PERMANENT = range(4)
-
-
-def interface_of(law: Cohesive, contact: Any) -> Callable[..., Interface]:
-    """Class of a contact's interface; InputError for a law of points, which have no areas."""
-    if contact.contactor.dim == 0:
-        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
-    return partial(CohesiveInterface, law=law, contact=contact)
 
 
 class CohesiveInterface(Interface):

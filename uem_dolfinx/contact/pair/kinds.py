@@ -3,31 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from uem_dolfinx.arrays import Indices
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.placement import Discretisation
+from uem_dolfinx.errors import InputError
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.ties.tie import Tie
 
 
 def kind_of_interface(contact: Any) -> Callable[..., Interface]:
-    """Class of a contact's interface: hard, soft, with cohesion, or with a fluid."""
+    """Class of a contact's interface: hard, soft, with cohesion, or with a fluid.
+
+    Raises:
+        InputError: for a law of points, which have no areas.
+    """
+    law = contact.normal or contact.cohesion or contact.leak
+    if law is None:
+        return Interface
+    if contact.contactor.dim == 0:
+        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
+    kind: Any
     if contact.normal is not None:
         from uem_dolfinx.contact.pair import soft
 
-        return soft.interface_of(contact.normal, contact)
-    if contact.cohesion is not None:
-        from uem_dolfinx.contact.pair import adhesive, cohesive
-
-        return (cohesive if contact.cohesion.bonds else adhesive).interface_of(contact.cohesion, contact)
-    if contact.leak is not None:
+        kind = soft.SoftInterface
+    elif contact.leak is not None:
         from uem_dolfinx.contact.pair import leaking
 
-        return leaking.interface_of(contact.leak, contact)
-    return Interface
+        kind = leaking.LeakingInterface
+    else:
+        from uem_dolfinx.contact.pair import adhesive, cohesive
+
+        kind = cohesive.CohesiveInterface if contact.cohesion.bonds else adhesive.AdhesiveInterface
+    return partial(kind, law=law, contact=contact)
 
 
 def tie_of(contact: Any, nodes: Indices, discretisation: Discretisation, means: Any, **of: Any) -> Tie | None:

@@ -8,9 +8,7 @@ directions and areas are those at the beginning of the step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,13 +28,6 @@ from uem_dolfinx.parallel import reduced
 #: A contactor that the fluid has reached and left so often in a step keeps it until the step ends.
 #: [bound; changes in a step; -]
 MOST_REACHED = 3
-
-
-def interface_of(law: Leak, contact: Any) -> Callable[..., Interface]:
-    """Class of a contact's interface; InputError for a law of points, which have no areas."""
-    if contact.contactor.dim == 0:
-        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
-    return partial(LeakingInterface, law=law, contact=contact)
 
 
 class LeakingInterface(Interface):

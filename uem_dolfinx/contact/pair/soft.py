@@ -12,9 +12,7 @@ contact holds, gaps with a stiffness are held.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from mpi4py import MPI
@@ -31,7 +29,6 @@ from uem_dolfinx.contact.seam.dyads import Terms, grouped
 from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.placement import ContactRows, Traction
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
 
 #: A gap holds a body that nothing else holds where it has more than this part of its stiffness at rest.
@@ -40,13 +37,6 @@ HELD_FROM = 1e-6
 #: Gaps under a pressure are found by so many bisections, and one step of Newton's method.
 #: [bound; bisections; -]
 BISECTIONS = 30
-
-
-def interface_of(law: SoftContact, contact: Any) -> Callable[..., Interface]:
-    """Class of a contact's interface; InputError for a law of points, which have no areas."""
-    if contact.contactor.dim == 0:
-        raise InputError(f"contact '{contact.name}': {law!r} needs areas, and points have none: give facets")
-    return partial(SoftInterface, law=law, contact=contact)
 
 
 def stiffness_of_gaps(pair: Interface, stiffness: Array) -> tuple[Ints, Ints, Array]:

@@ -137,7 +137,6 @@ class StepperWithMass(ExplicitStepper):
         for pair in problem.interfaces:
             check_moved(pair)
         self.system.begin_step()
-        self.system.place()
         history = solve_united(
             self.bodies,
             self.system,
