@@ -191,15 +191,15 @@ class GeneralContact(OfProblem, given.Sealed):
 
     def _refuse_open_conductance(self, config: Configuration, bound: float) -> None:
         """Raise InputError for heat flow through gaps, since only facets within reach are searched (collective)."""
-        gaps = bound * np.array([1.0, 1e-2, 1e-4])
+        gaps, some = bound * np.array([1.0, 1e-2, 1e-4]), np.array([1.0, 1e2, 1e4])
         for law in self.heats:
-            open_ = law.conductances(config.comm, self.name, np.zeros(3), gaps, np.zeros(3, bool))
-            if not open_.any():
-                continue
-            raise InputError(
-                f"{self.name}: heat, h(0, g) is {open_.max():.6g} at gaps g: a general contact conducts where surfaces touch alone: "
-                "expected 0 for g > 0, or a Contact between the two surfaces that conduct through their gap"
-            )
+            state = (np.zeros(3), gaps, some, 0.5 * some)[: 4 if law.of_temperatures else 2]
+            open_ = law.conductances(config.comm, self.name, state, np.zeros(3, bool))
+            if open_.any():
+                raise InputError(
+                    f"{self.name}: heat, h(0, g) is {open_.max():.6g} at gaps g: a general contact conducts where surfaces touch alone: "
+                    "expected 0 for g > 0, or a Contact between the two surfaces that conduct through their gap"
+                )
 
     def _refuse_distant_pressures(self, config: Configuration) -> None:
         """Raise InputError for pressures at gaps beyond the reach of the search, half a facet (collective)."""

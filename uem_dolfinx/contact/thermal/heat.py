@@ -1,12 +1,12 @@
-"""Heat conduction through one interface, conservative by the weights of the contact, and frictional heat.
+"""Heat conduction through one interface, conservative by the weights of the contact, and heat of friction and of currents.
 
 The temperature is a further field of the mixed space. The power ``q_i A_i`` with ``q_i = h (T_i - sum_a N_a T_a)`` enters the
 field's equations at contactor i, and with opposite sign at the opposite nodes. With rows ``v_i`` for the jumps of the unknowns,
-these terms are ``sum_i v_i q_i A_i`` with the symmetric derivative ``sum_i A_i h v_i v_i'``. A conductance h(p, g) adds ``sum_i A_i
-(T_i - sum_a N_a T_a) v_i (dh/dp p_i' + dh/dg g_i')``. Here dh/dp and dh/dg are finite differences, gaps change by ``n (du_i - sum_a
-N_a du_a)``, and pressures by the rows of K at the contactors over their areas. Pressures in h, and frictional heat, are the
-prediction of the last linearised problem. Perfect conductance is the constraint ``v_i' T = 0``: one unknown of each touching
-contactor is eliminated, and the heat flow is the multiplier.
+these terms are ``sum_i v_i q_i A_i`` with the symmetric derivative ``sum_i A_i h v_i v_i'``. A conductance h(p, g, T, T_target)
+adds ``sum_i A_i (T_i - sum_a N_a T_a) v_i (dh/dp p_i' + dh/dg g_i' + dh/dT T_i' + dh/dT_target T_target,i')``. Derivatives of h
+are finite differences, gaps change by ``n (du_i - sum_a N_a du_a)``, and pressures by the rows of K at the contactors over their
+areas. Pressures in h, and frictional heat, are the prediction of the last linearised problem. Perfect conductance is the
+constraint ``v_i' T = 0``: one unknown of each touching contactor is eliminated, and the heat flow is the multiplier.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ import numpy as np
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.conductance import Conductance, value
-from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
 from uem_dolfinx.contact.seam.dyads import Terms, dyads
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.thermal.sides import Sides, sides_of
+from uem_dolfinx.contact.thermal.sources import FrictionalHeat, JouleHeat, Source
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.fields import ConfigurationAmongFields
-from uem_dolfinx.geometry.nodal_fields import nodal_field
+from uem_dolfinx.geometry.nodal_fields import NodalField, nodal_field
 from uem_dolfinx.geometry.projection import Projection, Target
 from uem_dolfinx.parallel import reduced
 
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
 
 
-#: A conductance is differentiated over so much of the largest pressure, or of the largest gap.
-#: [derived; largest pressure or gap; test_heat.py::test_the_tangent_by_gaps_and_pressures]
+#: A conductance is differentiated over so much of the largest pressure, gap or temperature.
+#: [derived; largest pressure, gap or temperature; test_heat.py::test_the_tangent_by_gaps_and_pressures]
 OF_CONDUCTANCE = np.finfo(float).eps ** 0.5
 
 
@@ -156,8 +156,15 @@ class Heat:
             raise InputError(
                 f"{words}: friction_share = {law.friction_share} is a part of no heat, since the contact has no friction: leave it out"
             )
-        self.law, self.field, self._pair = law, nodal_field(config, law.field, words), pair
+        self.law, self.field, self.pair = law, nodal_field(config, law.field, words), pair
         self._contact, self._column = contact, column
+        #: Heat that the contact itself makes.
+        self.sources: list[Source] = [] if law.friction_share is None else [FrictionalHeat(self, law.friction_share)]
+        self._of = nodal_field(config, law.field_of_h, words)
+        if law.temperature is not None and law.field_of_h != law.field:
+            raise InputError(
+                f"{words}: of_field = {law.of_field}, and a rigid target has no values of that field: expected h(p, g), or a meshed target"
+            )
         if law.perfect and self.field.weights.shape[1] > 1:
             raise SpaceError(
                 f"{words}: h = inf unites temperatures at the displacement's nodes: give the field the displacement's degree"
@@ -169,13 +176,13 @@ class Heat:
     @property
     def lags(self) -> bool:
         """Whether heat depends on contact forces, which are taken from the previous iteration."""
-        return callable(self.law.h) or self.law.friction_share is not None
+        return callable(self.law.h) or any(source.lags for source in self.sources)
 
     # -- perfect conductance ---------------------------------------------------------------------------------------------
 
     def equations(self) -> HeatEquations:
         """Equations for temperatures of touching contactors; contactors that may touch have inactive equations (collective)."""
-        pair, at, g = self._pair, self.passage, self._pair.config.gdim
+        pair, at, g = self.pair, self.passage, self.pair.config.gdim
         which = np.flatnonzero((pair.united | pair.reserved) & at.leads)
         place = np.full(len(pair.nodes), -1, dtype=np.int64)
         place[which] = np.arange(len(which))
@@ -199,7 +206,7 @@ class Heat:
 
     def read(self, equations: HeatEquations, multipliers: Array, redundant: Bools) -> Array:
         """Power from the contactors to the target ``(n,)``, from the multipliers of equations ``(m,)``, of which some are ``redundant``."""
-        power = np.zeros(len(self._pair.nodes))
+        power = np.zeros(len(self.pair.nodes))
         power[equations.which] = -multipliers / equations.own
         self._held = np.zeros(len(power), dtype=bool)
         self._held[equations.which] = redundant
@@ -210,10 +217,10 @@ class Heat:
         if not self.law.perfect:
             return 0.0
         at = self.passage
-        united = self._pair.united & at.leads & ~self._held
+        united = self.pair.united & at.leads & ~self._held
         hot = at.means(at.own, np.abs(self.field.values)) + at.means(at.theirs, np.abs(self.field.values))
         both = np.array([np.abs(self.jump()[united]).max(initial=0.0), hot[united].max(initial=0.0)])
-        jump, size = reduced(self._pair.config.comm, both, op=MPI.MAX)
+        jump, size = reduced(self.pair.config.comm, both, op=MPI.MAX)
         return float(jump / size) if size > 0 else 0.0
 
     # -- finite conductance ----------------------------------------------------------------------------------------------
@@ -222,8 +229,8 @@ class Heat:
     def passage(self) -> Passage:
         """Heat flow of the last placement (collective)."""
         # projections are identical on all ranks or on none
-        if self._passage is None or self._passage.projection is not self._pair.projection:
-            pair, current = self._pair, self._contact.measure == "current"
+        if self._passage is None or self._passage.projection is not self.pair.projection:
+            pair, current = self.pair, self._contact.measure == "current"
             areas = self._contact.areas_facing(pair.nodes, pair.projection.normal, current)
             pressures, leads = pair.kinematics.pressure_map(current), self._contact.leads()
             self._passage = Passage(**vars(sides_of(pair)), areas=pressures.of_means(areas), force=pressures.force, leads=leads)
@@ -231,35 +238,51 @@ class Heat:
 
     def conductances(self) -> Array:
         """Conductances at the contactors ``(n,)``, zero past an end of the target (collective)."""
-        return self._conductances(*self._pressures_and_gaps())
+        return self._conductances(*self._state())
 
-    def _pressures_and_gaps(self) -> tuple[Array, Array]:
-        """Pressures and gaps at the contactors ``(n,)``; one of the two is zero (collective)."""
-        closed = self._pair.united
-        p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self._pair.projection.gap, 0.0))
+    def _state(self) -> tuple[Array, ...]:
+        """What h is a function of at the contactors ``(n,)``: pressures and gaps, one of the two zero, and temperatures (collective)."""
+        closed = self.pair.united
+        p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self.pair.projection.gap, 0.0))
         if callable(self.law.h):
             # forces may be negative before the active set has converged, and at ties
             p = np.where(closed, np.maximum(self._contact.pressing()[0], 0.0) * self._per_area(), 0.0)
-        return p, g
+        return (p, g, *self._temperatures()) if self.law.of_temperatures else (p, g)
+
+    def _temperatures(self) -> tuple[Array, Array]:
+        """Means of ``of_field`` on both sides ``(n,)``; contactors without a target get their own value twice (collective)."""
+        at = self.passage
+        own = at.means(self._shares(at.own), self._of.values)
+        if self.law.temperature is not None:
+            return own, np.full(len(own), value(self.law.temperature))
+        return own, np.where(at.sum(at.theirs) != 0.0, at.means(self._shares(at.theirs), self._of.values), own)
+
+    def _shares(self, weights: Array) -> Array:
+        """Weights of a mean ``(k,)`` over their sum."""
+        total = self.passage.sum(weights)
+        return np.asarray(weights / np.where(total != 0.0, total, 1.0)[self.passage.row])
 
     def _per_area(self) -> Array:
         """Pressures over forces ``(n,)`` (collective)."""
         areas = self._contact.measured_areas()
         return np.where(areas > 0, 1.0 / np.where(areas > 0, areas, 1.0), 0.0)
 
-    def _conductances(self, p: Array, g: Array) -> Array:
-        pair, closed = self._pair, self._pair.united
-        h = self.law.conductances(pair.config.comm, pair.name, p, g, closed)
+    def _conductances(self, *state: Array) -> Array:
+        pair, closed = self.pair, self.pair.united
+        h = self.law.conductances(pair.config.comm, pair.name, state, closed)
         return np.where((closed | ~pair.off) & self.passage.leads, h, 0.0)
 
-    def _slopes(self) -> Array:
-        """Derivatives of the power by the pressures of closed contactors, and by the gaps of open ones ``(n,)`` (collective)."""
-        p, g = self._pressures_and_gaps()
-        largest = reduced(self._pair.config.comm, np.array([np.abs(p).max(initial=0.0), g.max(initial=0.0)]), op=MPI.MAX)
-        at_p, at_g = OF_CONDUCTANCE * largest
-        more = np.where(self._pair.united, at_p, np.where(self._pair.projection.gap > 0.0, at_g, 0.0))
-        ahead = self._conductances(p + np.where(self._pair.united, more, 0.0), g + np.where(self._pair.united, 0.0, more))
-        slopes = (ahead - self._conductances(p, g)) / np.where(more > 0.0, more, 1.0)
+    def _slopes(self, k: int) -> Array:
+        """Derivatives of the power by argument k of h ``(n,)`` (collective).
+
+        The pressure, argument 0, changes at closed contactors, and the gap, argument 1, at open ones.
+        """
+        state, closed = self._state(), self.pair.united
+        largest = reduced(self.pair.config.comm, float(np.abs(state[k]).max(initial=0.0)), op=MPI.MAX)
+        changes = (closed, ~closed & (self.pair.projection.gap > 0.0))[k] if k < 2 else np.ones(len(closed), dtype=bool)
+        more = np.where(changes, OF_CONDUCTANCE * largest, 0.0)
+        ahead = self._conductances(*state[:k], state[k] + more, *state[k + 1 :])
+        slopes = (ahead - self._conductances(*state)) / np.where(more > 0.0, more, 1.0)
         return np.asarray(slopes * self.jump() * self.passage.areas)
 
     def jump(self) -> Array:
@@ -271,8 +294,8 @@ class Heat:
     def power(self) -> Array:
         """Power from the contactors to the target ``(n,)`` (collective)."""
         if self.law.perfect:
-            assert self._pair.trial.heat is not None
-            return self._pair.trial.heat[:, self._column]
+            assert self.pair.trial.heat is not None
+            return self.pair.trial.heat[:, self._column]
         return np.asarray(self.conductances() * self.jump() * self.passage.areas)
 
     def flux(self) -> Array:
@@ -280,44 +303,38 @@ class Heat:
         if not self.law.perfect:
             return np.asarray(self.conductances() * self.jump())
         # integrals of shape functions of degree 2 vanish at some nodes
-        through = np.where(self._pair.united & self.passage.leads, self.passage.areas, 0.0)
-        power, areas = (self._pair.discretisation.spread(part) for part in (self.power(), through))
+        through = np.where(self.pair.united & self.passage.leads, self.passage.areas, 0.0)
+        power, areas = (self.pair.discretisation.spread(part) for part in (self.power(), through))
         return np.where(areas > 0, power / np.where(areas > 0, areas, 1.0), 0.0)
 
-    def friction(self) -> Array:
-        """Frictional power in the present step ``(n,)`` (collective)."""
-        pair, state = self._pair, self._pair.trial.friction
-        assert pair.friction is not None and state is not None
-        work = pair.friction.step(pair.trial, pair.committed, pair.kinematics)[-1]
-        # contactors that stick in a mean slip by the rounding of positions
-        slips = np.abs(work) > GAP_ROUNDING * pair.config.size * np.linalg.norm(state.tau, axis=1)
-        return np.where(slips, work, 0.0) / value(self.law.dt)
-
     def nodal(self) -> tuple[Array, Array]:
-        """Power that owned nodes lose by conduction, and power that they gain by friction, ``(n_owned,)`` each.
+        """Power that owned nodes lose by conduction, and power that they gain by sources, ``(n_owned,)`` each.
 
         Collective.
         """
-        if not self._pair.asked:
-            none = np.zeros(self._pair.config.n_owned)
+        if not self.pair.asked:
+            none = np.zeros(self.pair.config.n_owned)
             return none, none
         at = self.passage
         passing = at.hand_on(at.jump, self.power())
-        if self.law.friction_share is None:
-            return passing, np.zeros_like(passing)
-        share = self.law.friction_share
-        return passing, at.hand_on(share * at.own + (1.0 - share) * at.theirs, self.friction())
+        return passing, sum((at.hand_on(self.weights(source), source.power()) for source in self.sources), np.zeros_like(passing))
+
+    def weights(self, source: Source) -> Array:
+        """Weights of a source's heat in the terms of both sides ``(k,)``."""
+        return source.share * self.passage.own + (1.0 - source.share) * self.passage.theirs
 
     def sizes(self) -> Array:
         """Magnitudes of the operands in differences of heat terms, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
-        at, pair, hot = self.passage, self._pair, np.abs(self.field.values)
-        size = np.zeros(len(at.areas))
-        if not self.law.perfect:
-            size = self.conductances() * at.areas * (at.means(at.own, hot) + at.means(at.theirs, hot))
-        if self.law.friction_share is not None and pair.trial.friction is not None:
-            # slips are differences of positions
-            size = size + pair.config.size * np.linalg.norm(pair.trial.friction.tau, axis=1) / value(self.law.dt)
+        at = self.passage
+        size = sum((source.sizes() for source in self.sources), self.power_sizes())
         return self.field.rows(at.hand_on(at.own + at.theirs, size))
+
+    def power_sizes(self) -> Array:
+        """Magnitudes of the operands in the power of finite conductance ``(n,)`` (collective)."""
+        at, hot = self.passage, np.abs(self.field.values)
+        if self.law.perfect:
+            return np.zeros(len(at.areas))
+        return np.asarray(self.conductances() * at.areas * (at.means(at.own, hot) + at.means(at.theirs, hot)))
 
     def residual(self) -> Array:
         """Contribution of heat to the residual, in the rows of vectors ``(n_rows * gdim,)`` (collective)."""
@@ -325,22 +342,39 @@ class Heat:
         # heat flow by constraint equations is not part of the residual
         return self.field.rows(-made if self.law.perfect else passing - made)
 
+    def changes(self) -> list[tuple[Array, Terms]]:
+        """Derivatives of the power by temperatures and gaps: scales ``(n,)`` of linear functions of the unknowns (collective)."""
+        at, pair = self.passage, self.pair
+        if self.law.perfect:
+            return []
+        found = [(self.conductances() * at.areas, self.jumps())]
+        if callable(self.law.h):
+            opening = Terms(at.row, at.node, at.jump[:, None] * pair.projection.normal[at.row])
+            found.append((np.where(pair.united, 0.0, self._slopes(1)), opening))
+        if self.law.of_temperatures:
+            found += [
+                (self._slopes(2 + k), self._terms(self._of, self._shares(side))) for k, side in enumerate((at.own, at.theirs))
+            ]
+        return found
+
+    def by_pressures(self) -> Array:
+        """Derivatives of the power by the pressures of closed contactors ``(n,)`` (collective)."""
+        return self._slopes(0) if callable(self.law.h) else np.zeros(len(self.passage.areas))
+
     def tangent(self) -> list[tuple[Ints, Array]]:
         """Derivatives of the residual by temperatures and gaps (collective).
 
         Returns:
             Pairs of global rows ``(k, m)``, -1 for no row, and blocks ``(k, m gdim, m gdim)``.
         """
-        at, jumps = self.passage, self._jumps()
-        kappa = np.zeros(len(at.areas)) if self.law.perfect else self.conductances() * at.areas
-        found = [dyads(kappa, jumps, jumps)]
-        if callable(self.law.h):
-            opening = at.jump[:, None] * self._pair.projection.normal[at.row]
-            slopes = np.where(self._pair.united, 0.0, self._slopes())
-            found.append(dyads(slopes, jumps, Terms(at.row, at.node, opening)))
+        jumps = self.jumps()
+        found = [dyads(scale, jumps, right) for scale, right in self.changes()]
+        for source in self.sources:
+            enters = self._terms(self.field, -self.weights(source))
+            found += [dyads(scale, enters, right) for scale, right in source.changes()]
         return found
 
-    def by_forces(self, equations: ContactRows, lift: Array) -> tuple[Ints, Array]:
+    def by_forces(self, equations: ContactRows, lift: Array) -> list[tuple[Ints, Array]]:
         """Derivatives of the residual by forces F at the contactors, with multipliers ``lift F``; see ``tangent`` (collective).
 
         They are neglected at degree 2, where each pressure depends on the forces of several contactors.
@@ -349,20 +383,31 @@ class Heat:
             equations: of the interface, in the present state.
             lift: of each ``(m, gdim)``.
         """
-        pair, config = self._pair, self._pair.config
-        slopes = np.where(pair.trial.active & (config.degree == 1), self._slopes(), 0.0)
-        weights, own = slopes * self._per_area() * self.passage.force, equations.normal
+        pair, config = self.pair, self.pair.config
+        parts = [(self.by_pressures(), self.jumps())] if callable(self.law.h) else []
+        parts += [
+            (source.by_pressures(), self._terms(self.field, -self.weights(source))) for source in self.sources if source.lags
+        ]
+        if not parts:
+            return []
+        own = equations.normal
         which = equations.contactor[own]
-        return dyads(weights, self._jumps(), Terms(which, config.to_global(pair.nodes[which]), lift[own]))
+        forces = Terms(which, config.to_global(pair.nodes[which]), lift[own])
+        scale = np.where(pair.trial.active & (config.degree == 1), self._per_area() * self.passage.force, 0.0)
+        return [dyads(slopes * scale, left, forces) for slopes, left in parts]
 
-    def _jumps(self) -> Terms:
-        """Temperature jumps of contactors as linear functions of the unknowns (collective)."""
-        at, g = self.passage, self._pair.config.gdim
-        known: Any = at.halo.take(self.field.terms)
+    def jumps(self) -> Terms:
+        """Jumps of the field at contactors as linear functions of the unknowns (collective)."""
+        return self._terms(self.field, self.passage.jump)
+
+    def _terms(self, field: NodalField, weights: Array) -> Terms:
+        """Sums of a field over the terms of contactors, with weights ``(k,)``, as linear functions of the unknowns (collective)."""
+        at, g = self.passage, self.pair.config.gdim
+        known: Any = at.halo.take(field.terms)
         number, weight = np.hsplit(known, 2)
         some = weight != 0
         row = np.broadcast_to(at.row[:, None], weight.shape)[some]
-        number, weight = number[some].astype(np.int64), (at.jump[:, None] * weight)[some]
+        number, weight = number[some].astype(np.int64), (weights[:, None] * weight)[some]
         vector = np.zeros((len(row), g))
         vector[np.arange(len(row)), number % g] = weight
         return Terms(row, number // g, vector)
@@ -377,4 +422,8 @@ def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared) -> list
     columns = np.cumsum([law.perfect for law in laws])
     if columns[-1]:
         pair.trial = pair.committed = replace(pair.committed, heat=np.zeros((len(pair.nodes), columns[-1])))
-    return [Heat(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
+    heats = [Heat(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
+    for heat in heats:
+        if heat.law.joule is not None:
+            heat.sources.append(JouleHeat([one for one in heats if one.law.field == heat.law.joule], heat.law.joule_share))
+    return heats

@@ -197,7 +197,7 @@ class BodyState(IterationState):
         if test.rings is not None or self.rows.conflict:
             return self
         for pair, own in zip(self.rows.pairs, self.rows.equations):
-            parts += [heat.by_forces(own, test.lift[first : first + len(own)]) for heat in pair.heats if callable(heat.law.h)]
+            parts += [part for heat in pair.heats for part in heat.by_forces(own, test.lift[first : first + len(own)])]
             first += len(own)
         if not parts:
             return self

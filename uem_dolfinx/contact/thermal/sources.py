@@ -1,0 +1,137 @@
+"""Heat that a contact makes: of friction, and of electric currents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.laws.conductance import Conductance, value
+from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
+from uem_dolfinx.contact.seam.dyads import Terms
+
+
+class Source(Protocol):
+    """Heat that enters both sides at contactors."""
+
+    share: float
+
+    @property
+    def lags(self) -> bool:
+        """Whether it depends on contact forces, which are taken from the previous iteration."""
+
+    def power(self) -> Array:
+        """Its power at contactors ``(n,)`` (collective)."""
+
+    def sizes(self) -> Array:
+        """Magnitudes of the operands in its differences ``(n,)`` (collective)."""
+
+    def changes(self) -> list[tuple[Array, Terms]]:
+        """Its derivatives; see ``Heat.changes`` (collective)."""
+
+    def by_pressures(self) -> Array:
+        """Its derivatives by the pressures of closed contactors ``(n,)`` (collective)."""
+
+
+class Flow(Protocol):
+    """Members of the heat, or of the current, of one conductance that sources need; as in ``Heat``."""
+
+    law: Conductance
+    pair: Any
+
+    def power(self) -> Array:
+        """Power from the contactors to the target ``(n,)`` (collective)."""
+
+    def power_sizes(self) -> Array:
+        """Magnitudes of the operands in this power ``(n,)`` (collective)."""
+
+    def jump(self) -> Array:
+        """Jump of the field ``(n,)`` (collective)."""
+
+    def jumps(self) -> Terms:
+        """These jumps as linear functions of the unknowns (collective)."""
+
+    def changes(self) -> list[tuple[Array, Terms]]:
+        """Derivatives of the power by temperatures and gaps (collective)."""
+
+    def by_pressures(self) -> Array:
+        """Derivatives of the power by pressures ``(n,)`` (collective)."""
+
+
+class FrictionalHeat:
+    """Work of friction of the present step over the step's duration; its derivatives are neglected.
+
+    Args:
+        heat: whose field it enters.
+        share: part that enters the contactor.
+    """
+
+    lags = True
+
+    def __init__(self, heat: Flow, share: float):
+        self.share, self._pair, self._law = share, heat.pair, heat.law
+
+    def power(self) -> Array:
+        """Power ``(n,)`` (collective)."""
+        pair, state = self._pair, self._pair.trial.friction
+        assert pair.friction is not None and state is not None
+        work = pair.friction.step(pair.trial, pair.committed, pair.kinematics)[-1]
+        # contactors that stick in a mean slip by the rounding of positions
+        slips = np.abs(work) > GAP_ROUNDING * pair.config.size * np.linalg.norm(state.tau, axis=1)
+        return np.where(slips, work, 0.0) / value(self._law.dt)
+
+    def sizes(self) -> Array:
+        """Slips are differences of positions."""
+        pair = self._pair
+        if pair.trial.friction is None:
+            return np.zeros(len(pair.nodes))
+        return np.asarray(pair.config.size * np.linalg.norm(pair.trial.friction.tau, axis=1) / value(self._law.dt))
+
+    def changes(self) -> list[tuple[Array, Terms]]:
+        """None."""
+        return []
+
+    def by_pressures(self) -> Array:
+        """None."""
+        return np.zeros(len(self._pair.nodes))
+
+
+class JouleHeat:
+    """Currents times jumps of the potential. A perfect conductance has no jump, and makes no heat.
+
+    Args:
+        currents: conductances of the potential.
+        share: part that enters the contactor.
+    """
+
+    def __init__(self, currents: Sequence[Flow], share: float):
+        self.share, self._currents = share, [one for one in currents if not one.law.perfect]
+        self._none = np.zeros(len(currents[0].pair.nodes))
+
+    @property
+    def lags(self) -> bool:
+        """Whether currents depend on contact forces."""
+        return any(callable(one.law.h) for one in self._currents)
+
+    def power(self) -> Array:
+        """Power ``(n,)`` (collective)."""
+        return sum((one.power() * one.jump() for one in self._currents), self._none)
+
+    def sizes(self) -> Array:
+        """The square of a jump has the rounding of the jump, twice."""
+        return sum((2.0 * one.power_sizes() * np.abs(one.jump()) for one in self._currents), self._none)
+
+    def changes(self) -> list[tuple[Array, Terms]]:
+        """Of the currents times the jumps, and of the jumps times the currents."""
+        found = []
+        for one in self._currents:
+            jump = one.jump()
+            found += [(jump * scale, right) for scale, right in one.changes()]
+            found.append((one.power(), one.jumps()))
+        return found
+
+    def by_pressures(self) -> Array:
+        """Of the currents, times the jumps."""
+        return sum((one.jump() * one.by_pressures() for one in self._currents), self._none)
