@@ -25,7 +25,7 @@ ROOMS = [
 #: Folders within contact/ from the ground up, and files of its own among them; ``""`` is all its other files.
 FLOORS = {
     "uem_dolfinx.contact": [
-        "laws", "seam", "nodes", "mortar", "friction", "ties", "thermal", "pair", "offsets", "results", "warnings", "", "general",
+        "laws", "seam", "nodes", "mortar", "friction", "ties", "thermal", "pair", "offsets", "heat_results", "results", "warnings", "", "general",
     ],
     "uem_dolfinx.solve": ["bodies", "rigid", "slots", "united", "", "steps"],
 }  # fmt: skip
