@@ -36,17 +36,17 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 __version__ = "0.2.0"
 
 __all__ = [
-    "Adaptation", "Adhesion", "Balance", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
+    "Adaptation", "Adhesion", "Balance", "Ball", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
     "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies",
     "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError",
-    "GeneralContact", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "Leak", "LinearElastic",
+    "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "Leak", "LinearElastic",
     "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton",
     "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad",
     "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results", "ResultsWriter", "RigidCoupling",
-    "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "SoftContact", "SpaceError",
-    "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags",
-    "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "Voce",
-    "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet",
+    "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "Slider", "SoftContact", "SpaceError",
+    "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError",
+    "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations",
+    "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet",
     "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh", "figure", "form", "function_space",
     "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
     "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
@@ -119,6 +119,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
+    from uem_dolfinx.conditions.joints import Ball, Hinge, Slider, Spring
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.laws.adhesion import Adhesion
     from uem_dolfinx.contact.laws.cohesive import Cohesive
@@ -180,7 +181,8 @@ _LATER = {
     "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
     "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation",
-    "RigidCoupling": "conditions.rigid_coupling",
+    "RigidCoupling": "conditions.rigid_coupling", "Ball": "conditions.joints", "Hinge": "conditions.joints",
+    "Slider": "conditions.joints", "Spring": "conditions.joints",
     "Preload": "contact.preload",
     "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening", "VonMises": "materials.von_mises",
     "HistoryWriter": "output.results", "ResultsWriter": "output.results",

@@ -150,7 +150,7 @@ def test_when_components_are_chosen_anew():
     b = Bar()
     config, coupling = Configuration(b.u), RigidCoupling(b.right, b.point, rotations="large")
     coupling.attach(config, False)
-    rows = RigidRows(config, coupling, np.ones((config.n_owned, 2), bool), np.zeros(config.n_owned, bool), [])
+    rows = RigidRows(config, [coupling], [], np.ones((config.n_owned, 2), bool), np.zeros(config.n_owned, bool), [])
     first = rows._basis
     for degrees, same in ((45.0, True), (70.0, False)):
         R = rotation_matrix(np.array([np.radians(degrees)]))

@@ -133,7 +133,7 @@ class AtPoints:
         for one, nodes in self.parts:
             found[nodes] += one.force_and_stiffness(self._config.gdim)[0]
         for coupling in self._couplings:
-            found[coupling.nodes.nodes] += coupling.nodal_forces()
+            found[coupling.nodes.nodes] += coupling.nodal_forces(springs=False)
         return found
 
     def energy(self) -> float:
@@ -142,7 +142,8 @@ class AtPoints:
         for one, nodes in self.parts:
             k = one.force_and_stiffness(self._config.gdim)[1]
             own += 0.0 if k is None else 0.5 * float(np.einsum("ng,gh,nh->", u[nodes], k, u[nodes]))
-        return float(reduced(self._config.comm, own))
+        links = {id(link): link for coupling in self._couplings for link in coupling.links}
+        return float(reduced(self._config.comm, own)) + sum(link.energy for link in links.values())
 
     def add_stiffness(self, K: PETSc.Mat) -> None:
         """Add the springs to an assembled tangent (collective)."""

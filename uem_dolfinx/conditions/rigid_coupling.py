@@ -107,6 +107,8 @@ class RigidCoupling(given.Sealed):
         self.turns: Array = np.zeros(self._sizes[1])
         #: Force and moment of the prescribed motion, as last computed.
         self.reactions: tuple[Array, Array] = np.zeros(self._sizes[0]), np.zeros(self._sizes[1])
+        #: Joints and springs that it takes part in.
+        self.links: list[Any] = []
         self._set: RigidSet | None = None
         self._evaluated: dict[str, Any] = {}
 
@@ -142,6 +144,10 @@ class RigidCoupling(given.Sealed):
             )
         return self._set
 
+    def belongs_to(self, config: Configuration) -> bool:
+        """Whether it is in the problem of a configuration."""
+        return self._set is not None and self._set.config is config
+
     def take_load(self, at: float) -> None:
         """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
         comm = self.nodes.config.comm
@@ -164,10 +170,18 @@ class RigidCoupling(given.Sealed):
         with agreed(self.nodes.config.comm):
             return self._values("force", self._sizes[0]), self._values("moment", self._sizes[1])
 
-    def nodal_forces(self) -> Array:
-        """Nodal forces of ``loads`` at the owned nodes of the part ``(n, gdim)`` (collective)."""
-        config = self.nodes.config
-        return self.nodes.spread(config.displacement[: config.n_owned], *self.loads())
+    def linked_load(self) -> tuple[Array, Array]:
+        """Force and moment of springs at the point (collective)."""
+        found = [link.load_on(self) for link in self.links if link.stiffness]
+        return sum((f for f, _ in found), np.zeros(self._sizes[0])), sum((m for _, m in found), np.zeros(self._sizes[1]))
+
+    def nodal_forces(self, springs: bool = True) -> Array:
+        """Nodal forces of ``loads`` and of springs at the owned nodes of the part ``(n, gdim)`` (collective)."""
+        config, (force, moment) = self.nodes.config, self.loads()
+        if springs and self.links:
+            more = self.linked_load()
+            force, moment = force + more[0], moment + more[1]
+        return self.nodes.spread(config.displacement[: config.n_owned], force, moment)
 
     def wanted(self) -> Array:
         """Present values of the prescribed components ``(k,)``, in the order of ``prescribed`` (collective)."""
@@ -213,8 +227,13 @@ class RigidCoupling(given.Sealed):
         _, (force, moment) = self.nodes, self.reactions
         return force, float(moment[0]) if len(moment) == 1 else moment
 
-    def read_reactions(self, forces: Array) -> None:
-        """Compute the reactions from the forces of the coupling at the owned nodes ``(n_owned, gdim)`` (collective)."""
+    def read_reactions(self, forces: Array, *of_joints: Array) -> None:
+        """Compute the reactions of the prescribed motion (collective).
+
+        Args:
+            forces: of the coupling's equations at the owned nodes ``(n_owned, gdim)``.
+            of_joints: force ``(gdim,)`` and moment ``(n_turns,)`` of joints among them, at the point.
+        """
         config, own = self.nodes.config, forces[self.nodes.nodes]
         at = self.nodes.placement(config.displacement[: config.n_owned])
         if self.nodes.large:
@@ -223,7 +242,7 @@ class RigidCoupling(given.Sealed):
             arms = self.nodes.X - self.point
         sums = reduced(config.comm, np.append(own.sum(axis=0), moments(arms, own).sum(axis=0)))
         held = np.isin(np.arange(len(sums)), list(self.prescribed))
-        sums = np.where(held, sums, 0.0)
+        sums = np.where(held, sums - np.concatenate(of_joints), 0.0)
         self.reactions = sums[: self._sizes[0]], sums[self._sizes[0] :]
 
 

@@ -9,13 +9,14 @@ with the same resultant and moment; this is the distribution nearest to a unifor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Indices, cross_products
+from uem_dolfinx.arrays import Array, Indices, Ints, cross_products
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.rigid import Motion, rotation_vector
+from uem_dolfinx.geometry.rigid import Motion, rotation_matrix, rotation_vector
 from uem_dolfinx.parallel import reduced
 
 
@@ -61,6 +62,12 @@ class Placement:
         if self.small is None:
             return self.motion.translation + (X - self.motion.about) @ (self.motion.Q - np.eye(X.shape[1])).T
         return self.motion.translation + turned(self.small, X - self.motion.about)
+
+    def moved(self, z: Array) -> Placement:
+        """After a further translation and finite rotation about the middle ``z (gdim + n_turns,)``."""
+        g = len(self.motion.about)
+        Q = rotation_matrix(z[g:]) @ self.motion.Q
+        return Placement(Motion(self.motion.translation + z[:g], Q, self.motion.about))
 
     @property
     def turn(self) -> Array:
@@ -141,3 +148,47 @@ class RigidSet:
         S = self._mean(np.einsum("ang,bng->nab", V, V))
         a: Array = np.asarray(np.linalg.lstsq(S, moment + moments(lever, force), rcond=None)[0], dtype=float)
         return np.asarray(force + turned(a, arms)) / self.count
+
+
+class RigidSets:
+    """Several sets whose motions are one vector z: translation and rotation of each set about its middle, one set after the other.
+
+    Args:
+        sets: without common nodes, all with finite or all with small rotations.
+
+    Attributes:
+        nodes: owned nodes of all sets ``(n,)``.
+        part: index of the set of each node ``(n,)``.
+        X: reference positions of the nodes ``(n, gdim)``.
+        scale: of the components of z ``(n_z,)``, see ``RigidSet.scale``.
+    """
+
+    def __init__(self, sets: Sequence[RigidSet]):
+        self.each, self.large = list(sets), sets[0].large
+        self.nodes: Indices = np.concatenate([one.nodes for one in sets])
+        self.part: Ints = np.repeat(np.arange(len(sets)), [len(one.nodes) for one in sets])
+        self.X: Array = np.concatenate([one.X for one in sets])
+        self.scale: Array = np.concatenate([one.scale for one in sets])
+        self._size = len(self.scale) // len(sets)
+
+    def __getitem__(self, i: int) -> slice:
+        """Components of z of a set."""
+        return slice(i * self._size, (i + 1) * self._size)
+
+    def placements(self, u: Array) -> list[Placement]:
+        """The nearest rigid placements for a displacement ``(n_owned, gdim)`` (collective)."""
+        return [one.placement(u) for one in self.each]
+
+    def velocities(self, at: Sequence[Placement], X: Array, part: Ints) -> Array:
+        """Velocities of points of sets ``part (n,)`` at reference positions ``X (n, gdim)`` in scaled motions ``(n, gdim, n_z)``."""
+        V = np.zeros((*X.shape, len(self.scale)))
+        for i, place in enumerate(at):
+            V[part == i, :, self[i]] = velocities(place.arms(X[part == i]))
+        return V * self.scale
+
+    def displacement(self, at: Sequence[Placement], X: Array, part: Ints) -> Array:
+        """Displacement of such points ``(n, gdim)``."""
+        u = np.empty_like(X)
+        for i, place in enumerate(at):
+            u[part == i] = place.displacement(X[part == i])
+        return u

@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.conditions.joints import Link
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+from uem_dolfinx.conditions.rigid_rates import rates
 from uem_dolfinx.conditions.rigid_rows import RigidRows
 from uem_dolfinx.conditions.united_rows import UnitedRows, forces_of
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, reduced
 
 
 class UserRows:
@@ -26,8 +30,9 @@ class UserRows:
     Args:
         config: configuration of the displacement.
         linear: linear equations, or None.
-        rigid: rows of each coupling that makes nodes rigid.
+        rigid: rows of couplings that make nodes rigid, together where joints or springs connect them.
         couplings: all couplings.
+        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
 
     Attributes:
         equations: of this rank, as last computed.
@@ -36,8 +41,14 @@ class UserRows:
     """
 
     def __init__(
-        self, config: Configuration, linear: UnitedRows | None, rigid: Sequence[RigidRows], couplings: Sequence[RigidCoupling]
+        self,
+        config: Configuration,
+        linear: UnitedRows | None,
+        rigid: Sequence[RigidRows],
+        couplings: Sequence[RigidCoupling],
+        free: Bools,
     ):
+        self._free = free
         self._config, self.linear, self.each, self._couplings = config, linear, list(rigid), list(couplings)
         self._parts: list[UnitedRows | RigidRows] = [one for one in (linear, *rigid) if one is not None]
         self.turning: bool = any(one.set.large for one in self.each)
@@ -50,12 +61,12 @@ class UserRows:
     @property
     def turns(self) -> list[Any]:
         """Data of the couplings in a checkpoint."""
-        return [one.turns for one in self.each]
+        return [kept for one in self.each for kept in one.turns]
 
     @turns.setter
     def turns(self, kept: list[Any]) -> None:
-        for one, own in zip(self.each, kept):
-            one.turns = own
+        for one in self.each:
+            one.turns, kept = kept[: one.n_turns], kept[one.n_turns :]
 
     @property
     def rigid(self) -> UserRows | None:
@@ -127,6 +138,15 @@ class UserRows:
         """Largest gap, a length, on this rank."""
         return max((one.largest_gap_here() for one in self._parts), default=0.0)
 
+    def joints_led(self, bound: float) -> bool:
+        """Whether prescribed motions have yet to lead jointed parts by more than ``bound``, a length (collective).
+
+        Such a step is taken whole: forces of a mechanism at rest, which vanish, are no measure of part of it.
+        """
+        linked = [one for one in self.each if one.jointed]
+        gap = max((one.largest_gap_here() for one in linked), default=0.0)
+        return bool(linked) and float(reduced(self._config.comm, gap, op=MPI.MAX)) > bound
+
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Geometric stiffness in the tangent: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
         parts = [one.curvature(forces) for one, forces in self._forces_of_each()] if self.turning else []
@@ -135,6 +155,14 @@ class UserRows:
     def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
         """Masses at points times a factor, by default of the time step, in the format of ``curvature`` (collective)."""
         return [part for part in (one.added_mass(factor) for one in self.each) if part is not None]
+
+    def stiffness(self) -> list[tuple[Ints, Array]]:
+        """Stiffness of springs between the couplings, without its part in ``curvature``, in the same format (collective)."""
+        return [part for part in (one.stiffness() for one in self.each) if part is not None]
+
+    def sprung(self) -> list[UnitingEquations]:
+        """Equations of the motions that springs between couplings resist (collective)."""
+        return [one.sprung() for one in self.each if one.springy]
 
     def _forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
         """The couplings' forces at the owned nodes ``(n_owned, gdim)`` (collective)."""
@@ -149,7 +177,7 @@ class UserRows:
         n, g = self._config.n_owned, self._config.gdim
         for one in (one for one in self.each if one.set.large):
             v, a = (f.x.array[: n * g].reshape(n, g).copy() for f in (dynamics.velocity, dynamics.acceleration))
-            v[one.set.nodes], a[one.set.nodes] = one.rates(dynamics.mass.times, v, a)
+            v[one.set.nodes], a[one.set.nodes] = rates(one, self._config, dynamics.mass.times, v, a, self._free)
             dynamics.change_rates(v.ravel(), a.ravel())
 
     def check(self) -> None:
@@ -157,8 +185,7 @@ class UserRows:
         if self.linear is not None:
             self.linear.check()
         for one, forces in self._forces_of_each():
-            one.end_step()
-            one.coupling.read_reactions(forces)
+            one.end_step(forces)
 
     def forces(self, multipliers: Array) -> Array:
         """Forces of the equations on the bodies, at the owned nodes ``(n_owned, gdim)`` (collective)."""
@@ -208,8 +235,22 @@ def rows_of_users(
         one.take_load(at)
         if not one.distribute:
             _refuse_shared(one, taken)
-            rigid.append(RigidRows(config, one, free, avoided, loaded))
+    for some, links in connected(couplings):
+        rigid.append(RigidRows(config, some, links, free, avoided, loaded))
     # linear equations do not eliminate components of couplings
     left = free & ~taken[:, None]
     linear = UnitedRows(config, equations, left, avoided, loaded, at) if equations else None
-    return UserRows(config, linear, rigid, couplings)
+    return UserRows(config, linear, rigid, couplings, free)
+
+
+def connected(couplings: Sequence[RigidCoupling]) -> list[tuple[list[RigidCoupling], list[Link]]]:
+    """Groups of couplings that joints or springs connect, with these; couplings without are groups of one."""
+    left, groups = [one for one in couplings if not one.distribute], []
+    while left:
+        group, links = [left.pop(0)], dict[int, Link]()
+        for one in group:
+            links |= {id(link): link for link in one.links}
+            group += [end for link in one.links for end in link.ends if not any(end is other for other in group)]
+        left = [one for one in left if not any(one is other for other in group)]
+        groups.append((group, list(links.values())))
+    return groups

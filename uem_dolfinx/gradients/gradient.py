@@ -205,7 +205,9 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
                 "gradients at an offset need a rigid plane, sphere or cylinder: gaps from other surfaces are distances on these alone"
             )
         if problem.linear is not None or problem.bodies.points is not None:
-            raise InputError("gradients do not support equations, forces and springs of nodes: expected a problem without them")
+            raise InputError(
+                "gradients do not support equations, couplings, joints, forces and springs of nodes: expected a problem without them"
+            )
     from uem_dolfinx.solve.steps.parted import part_contacts
 
     # derivatives are implemented for single contacts

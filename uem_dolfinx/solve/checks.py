@@ -25,6 +25,7 @@ from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, 
 from uem_dolfinx.parallel import agreed
 
 if TYPE_CHECKING:
+    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.dynamics.inertia import Dynamics
 
 #: Laws with history that belong to problems, by their ids.
@@ -70,6 +71,22 @@ def check_dynamics(dynamics: Any, contacts: Sequence[Any], others: Mapping[str, 
     given.kind("dynamics", dynamics, isinstance(dynamics, Dynamics), "Dynamics, or None")
     refuse_unsupported(dynamics, contacts, {**others} | ({} if usual else {"displacement or method": True}))
     return dynamics
+
+
+def check_couplings(couplings: Any) -> tuple[list[RigidCoupling], list[Any]]:
+    """The couplings of a list of couplings, joints and springs, and all of them, couplings first.
+
+    Raises:
+        InputTypeError: for other objects.
+    """
+    found = given.items(
+        "couplings",
+        couplings,
+        lambda one: hasattr(one, "nodal_forces") or hasattr(one, "ends"),
+        "a RigidCoupling, a joint or a Spring",
+    )
+    rigid = [one for one in found if not hasattr(one, "ends")]
+    return rigid, rigid + [one for one in found if hasattr(one, "ends")]
 
 
 def check_checkpoint(checkpoint: Any) -> None:

@@ -19,7 +19,7 @@ from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError, SpaceError
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, slip_terms, together
+from uem_dolfinx.solve.bodies.tangent import added_mass, contact_curvature, curvature_of, slip_terms, together
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.rows import make_rows
@@ -96,8 +96,10 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         P = rows.frictionless
         with timed("united matrix"):
             added = added_mass(system.linear, like)
-            # stiffness of soft contacts
+            # stiffness of soft contacts and of springs
             gaps, _ = slip_terms([pair for pair in pairs if pair.trial.has_law], like)
+            springs = [] if system.linear is None else system.linear.stiffness()
+            gaps = together(gaps, contact_curvature(springs, like) if springs else None)
             stiffness = together(bodies.tangent.K, together(curvature, gaps))
             A, B = _united(P, stiffness), _united(P, together(M, added))
     return _solve(slepc, problem, P, A, B, n)

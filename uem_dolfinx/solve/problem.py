@@ -41,6 +41,7 @@ from uem_dolfinx.solve.united.system import BodySystem
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, Periodic
+    from uem_dolfinx.conditions.joints import Link
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.conditions.user_rows import UserRows
     from uem_dolfinx.dynamics.inertia import Dynamics
@@ -66,7 +67,8 @@ class UnitedProblem(given.Sealed):
         bcs: Dirichlet conditions.
         contacts: contacts between bodies or with rigid surfaces, or a general contact of all surfaces; may be empty.
         equations: linear equations between displacements of nodes: ``Equation`` and ``periodic``.
-        couplings: parts that move rigidly with a point, or distribute its load: ``RigidCoupling``.
+        couplings: parts that move rigidly with a point, or distribute its load: ``RigidCoupling``; and ``Hinge``, ``Slider``, ``Ball``
+            and ``Spring`` between such parts.
         points: forces and springs at nodes in addition to F: ``PointLoad`` and ``PointSpring``.
         petsc_options_prefix: prefix of the linear solver's options.
         petsc_options: its options without prefix; by default MUMPS or CG with AMG, depending on the size. Unless they fix
@@ -108,7 +110,7 @@ class UnitedProblem(given.Sealed):
         bcs: Sequence[fem.DirichletBC] = (),
         contacts: Sequence[Contact | GeneralContact] = (),
         equations: Sequence[Equation | Periodic] = (),
-        couplings: Sequence[RigidCoupling] = (),
+        couplings: Sequence[RigidCoupling | Link] = (),
         points: Sequence[PointLoad | PointSpring] = (),
         petsc_options_prefix: str = "uem_",
         petsc_options: dict[str, Any] | None = None,
@@ -137,10 +139,9 @@ class UnitedProblem(given.Sealed):
                 "contacts", contacts, lambda one: isinstance(one, Contact | GeneralContact), "a Contact or a GeneralContact"
             )
             check_new(contacts)
-            equations = given.items(
-                "equations", equations, lambda one: hasattr(one, "n_values"), "an Equation, or what periodic returns"
-            )
-            couplings = given.items("couplings", couplings, lambda one: hasattr(one, "nodal_forces"), "a RigidCoupling")
+            what = "an Equation, or what periodic returns"
+            equations = given.items("equations", equations, lambda one: hasattr(one, "n_values"), what)
+            couplings, linked = checks.check_couplings(couplings)
             points = given.items(
                 "points", points, lambda one: hasattr(one, "force_and_stiffness"), "a PointLoad or a PointSpring"
             )
@@ -169,7 +170,7 @@ class UnitedProblem(given.Sealed):
         given.alike(
             self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in contacts], materials=len(self.materials),
             equations=[type(one).__name__ for one in equations], points=[type(one).__name__ for one in points],
-            couplings=[one.name for one in couplings],
+            couplings=[one.name for one in linked],
             J=J is None, jit_options=jit_options, newton=loop.method, **{k: v for k, v in vars(loop).items() if k != "method"},
         )  # fmt: skip
         #: Contacts as declared, and, below, their parts: a general contact consists of several.
@@ -193,7 +194,7 @@ class UnitedProblem(given.Sealed):
                 self.config, F if damping is None else F + damping, bcs, materials=self.materials, dynamics=dynamics, points=at_points,
                 check_inversion=loop.check_inversion, J=J if J is None or damping is None else J + ufl.derivative(damping, u),
             )  # fmt: skip
-        for one in couplings:
+        for one in linked:
             one.attach(self.config, not self.bodies.tangent.linear)
         if couplings:
             from uem_dolfinx.dynamics.added_mass import add_masses
@@ -248,7 +249,7 @@ class UnitedProblem(given.Sealed):
         #: Warnings issued during steps.
         self.watch = Watch(self.contacts)
         #: Settings of the run, for checkpoints.
-        declared = {"equations": equations, "couplings": couplings, "points": points}
+        declared = {"equations": equations, "couplings": linked, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in declared.items() if some}
         self.settings = Settings({"F": F, "damping": damping}, u, self.contacts, self.materials, dynamics, names)
         refuse_idle(self, self.load, self.bodies.bcs)

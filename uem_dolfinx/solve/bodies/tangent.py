@@ -207,7 +207,7 @@ def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:
 def slip_terms(
     pairs: Sequence[Interface], du: PETSc.Vec, linear: UserRows | None = None
 ) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
-    """Tangent terms of slip directions, heat through contacts and masses at points, and residual terms of slip (collective).
+    """Tangent terms of slip directions, heat through contacts, masses at points and springs, and residual terms of slip (collective).
 
     Args:
         pairs: of all contacts.
@@ -222,7 +222,7 @@ def slip_terms(
     heat = [part for pair in pairs for one in pair.heats for part in one.tangent()]
     slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
     passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0
-    masses = [] if linear is None else linear.added_mass()
+    masses = [] if linear is None else [*linear.added_mass(), *linear.stiffness()]
     if not (slips or passes or masses):
         return None, None
     added = contact_curvature([*((nodes, blocks) for nodes, blocks, _ in parts), *heat, *masses], du)

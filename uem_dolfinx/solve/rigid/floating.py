@@ -265,9 +265,11 @@ class FloatingBodies:
         return F
 
     def _rates(self, equations: UnitingEquations) -> Any:
-        """Rates of the active equations, see ``RigidMotions`` (collective)."""
+        """Rates of the active equations, and of springs between rigid parts, see ``RigidMotions`` (collective)."""
         assert self.motions is not None
-        return self.motions.rates(equations.select(equations.active))
+        more = [] if self._linear is None else self._linear.sprung()
+        rows = equations.select(equations.active)
+        return self.motions.rates(UnitingEquations.join([rows, *more], self._bodies.config.gdim) if more else rows)
 
     def _fall(self, place: Callable[[], None], freely: bool) -> bool:
         """Move bodies rigidly along their loads until contact holds them (collective).
@@ -321,7 +323,7 @@ class FloatingBodies:
         assert motions is not None
         pairs = in_question(self._pairs)
         equations = [pair.equations() for pair in pairs]
-        more = [] if self._linear is None else [self._linear.at_present()]
+        more = [] if self._linear is None else [self._linear.at_present(), *self._linear.sprung()]
         rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
         # sticking contactors are held in all directions; contactors without friction may separate again
         firm = [(e.permanent | pair.frictional)[e.resisting.active] for pair, e in zip(pairs, equations)]

@@ -418,7 +418,7 @@ class BodySystem:
             exact=not self.solver.inexact and (self.bodies.dynamics is not None or not passing),
             iterative=self.solver.inexact,
             passing=passing,
-            fits=linear,
+            fits=linear or (self.linear is not None and self.linear.joints_led(CLOSED * self.config.size)),
             convex=self.exchanges.convex,
         )
 

@@ -1,0 +1,114 @@
+"""Equations of joints and energies of springs by the motions z of all rigid sets that they connect."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from uem_dolfinx.algebra.rings import DEPENDENT
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.conditions.joints import Joint, Link
+from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+from uem_dolfinx.conditions.rigid_set import Placement, RigidSets
+from uem_dolfinx.errors import ConflictError
+
+#: Newton's method closes joints in so many steps; where it does not, the united system goes on.
+#: [bound; steps; -]
+MOST_CLOSINGS = 12
+
+
+class Linked:
+    """Joints and springs of couplings with a common vector of motions.
+
+    Args:
+        couplings: attached.
+        links: joints and springs, all of whose ends are among the couplings.
+        sets: nodes of the couplings.
+    """
+
+    def __init__(self, couplings: Sequence[RigidCoupling], links: Sequence[Link], sets: RigidSets):
+        self._couplings, self._links, self._sets = couplings, list(links), sets
+        self.joints = [one for one in links if isinstance(one, Joint)]
+        self.springy = any(one.stiffness for one in links)
+
+    def _places(self, places: Sequence[Placement]) -> dict[int, Placement]:
+        return {id(one): place for one, place in zip(self._couplings, places)}
+
+    def rows(self, places: Sequence[Placement]) -> tuple[Array, Array, Array]:
+        """Rows of joints ``(k, n_z)``, their residuals ``(k,)``, and second derivatives ``(k, n_z, n_z)``, 0 with small rotations."""
+        n, at = len(self._sets.scale), self._places(places)
+        found = [(joint, one) for joint in self.joints for one in joint.rows(at)]
+        C = np.array([self._by_motions(joint, one.slope) for joint, one in found]).reshape(-1, n)
+        value = np.array([one.value for _, one in found], dtype=float)
+        if not self._sets.large:
+            return C, 0.0 * value, np.zeros((len(C), n, n))
+        return C, value, np.array([self._by_motions(joint, one.bend) for joint, one in found]).reshape(-1, n, n)
+
+    def _by_motions(self, link: Link, array: Array) -> Array:
+        """A slope ``(12,)`` or second derivatives ``(12, 12)`` of a link by the motions of its ends, by all motions z."""
+        out = np.zeros([len(self._sets.scale)] * array.ndim)
+        ends = [(self._sets[self._index(one)], columns) for one, columns in link.columns()]
+        for to, columns in ends:
+            if array.ndim == 1:
+                out[to] = array[columns]
+            for other, others in ends if array.ndim == 2 else ():
+                out[to, other] = array[columns][:, others]
+        return out
+
+    def _index(self, coupling: RigidCoupling) -> int:
+        return next(i for i, one in enumerate(self._couplings) if one is coupling)
+
+    def closed(self, places: Sequence[Placement], firm: Array) -> list[Placement]:
+        """The nearest placements in which joints are closed, by Newton's method, with finite rotations.
+
+        Args:
+            places: of each set.
+            firm: rows of scaled motions that do not change ``(k, n_z)``.
+        """
+        best, now, least, scale = list(places), list(places), np.inf, self._sets.scale
+        _, size, axes = np.linalg.svd(firm)
+        open_ = axes[np.count_nonzero(size > DEPENDENT) :].T
+        for _ in range(MOST_CLOSINGS):
+            C, off, _ = self.rows(now)
+            miss = float(np.abs(off).max(initial=0.0))
+            if not miss < least:
+                break
+            best, least = now, miss
+            dz = scale * (open_ @ np.linalg.lstsq(C * scale @ open_, -off, rcond=DEPENDENT)[0])
+            now = [at.moved(dz[self._sets[i]]) for i, at in enumerate(now)]
+        return best
+
+    def stiffness(self, places: Sequence[Placement]) -> tuple[Array, Array]:
+        """Material and geometric stiffness of all springs by the motions z, both ``(n_z, n_z)`` (collective)."""
+        n, at = len(self._sets.scale), self._places(places)
+        material, geometric = np.zeros((2, n, n))
+        for link in self._links if self.springy else ():
+            _, _, first, second = link.stored(at, link.small_motions())
+            material += self._by_motions(link, first)
+            geometric += self._by_motions(link, second)
+        return material, geometric
+
+    def check(self, off: Array, bound: float) -> None:
+        """Refuse joints whose equations leave distances ``(k,)`` larger than a bound, as other equations contradict them.
+
+        Raises:
+            ConflictError: names the first joint.
+        """
+        first = 0
+        for joint in self.joints:
+            own = off[first : first + joint.n_rows]
+            first += joint.n_rows
+            if (own > bound).any():
+                ends = " and ".join("the ground" if one is None else f"'{one.name}'" for one in (joint.a, joint.b))
+                raise ConflictError(
+                    f"the {joint.name} of {ends} is missed by {own.max():.4g}: no motion satisfies it together with the other joints and "
+                    "prescribed values; give values that agree, or leave one of them out"
+                )
+
+    def read(self, places: Sequence[Placement], multipliers: Array) -> None:
+        """End a step with the multipliers of the rows ``(k,)`` (collective)."""
+        at, first = self._places(places), 0
+        for joint in self.joints:
+            joint.read(at, multipliers[first : first + joint.n_rows])
+            first += joint.n_rows
