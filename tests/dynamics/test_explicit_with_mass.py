@@ -172,3 +172,28 @@ def test_massless_nodes_are_refused():
     problem = uem.UnitedProblem(form, u, dynamics=uem.Dynamics(mass, scheme=uem.CentralDifferences(), contactors="massy"))
     with pytest.raises(uem.MassError, match="have no mass"):
         next(uem.time_steps(problem, end=1.0))
+
+
+@pytest.mark.parametrize("lower", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_velocities_at_rest(lower):
+    """Bodies that lie on a floor, or on each other, do not fall at the end of a step, by gravity times half a step or otherwise."""
+    g = 10.0
+    boxes = [box("quadrilateral", [0.0, float(y)], [1.0, y + 1.0], [3 - y, 2]) for y in range(2 if lower else 1)]
+    s = scene(COMM, "quadrilateral", boxes)
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    law, eta = uem.LinearElastic(1e4, 0.0, kind="plane_stress"), 60.0
+    contacts = [uem.Contact(s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane(np.zeros(2), np.array([0.0, 1.0])))]
+    if lower:
+        contacts.append(uem.Contact(s.tag("upper", 1, at(1, 1.0)), s.tag("top", 0, at(1, 1.0))))
+    dynamics = uem.Dynamics(
+        uem.lumped_mass(V, 1.0), gravity=(0.0, -g), scheme=uem.CentralDifferences(), contactors="massy",
+        damping=lambda rate: eta * ufl.inner(ufl.grad(rate), ufl.grad(v)) * ufl.dx,
+    )  # fmt: skip
+    problem = uem.UnitedProblem(law.residual(u, v) * ufl.dx, u, contacts=contacts, dynamics=dynamics)
+    for step in uem.time_steps(problem, end=0.6 if lower else 0.2):
+        pass
+    fastest = reduced(COMM, float(np.abs(dynamics.velocity.x.array).max()), op=MPI.MAX)
+    assert fastest < 1e-2 * 0.5 * step.dt * g
+    weight = g * len(boxes)
+    assert abs(contacts[0].resultant().force[1] / weight - 1.0) < 1e-3

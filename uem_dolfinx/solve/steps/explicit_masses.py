@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.warnings.checks import check_moved
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
@@ -126,10 +126,21 @@ class StepperWithMass(ExplicitStepper):
             problem.restore()
             raise
         a = self._accelerations()
-        half = (problem.u.x.array[:n] - begin) / dt
+        half, kick = (problem.u.x.array[:n] - begin) / dt, 0.5 * dt * a
+        # contact takes part in the change of the velocity, and the next step starts with the velocity in its middle all the same
+        taken = self._along_contact(kick) if history[-1].active else kick
         problem.commit()
-        dynamics.change_rates(np.where(self.moving, half + 0.5 * dt * a, dynamics.velocity.x.array[:n]), a)
+        dynamics.change_rates(np.where(self.moving, half + taken, dynamics.velocity.x.array[:n]), a + (kick - taken) * 2.0 / dt)
         return history
+
+    def _along_contact(self, change: Array) -> Array:
+        """Change of velocities ``(n,)`` by a kick and the impulses of contact, which keep gaps closed (collective)."""
+        M, rows, solver = self.bodies.tangent.K, self.system.rows, self.system.solver
+        assert rows is not None
+        P, Q = rows.frictionless, rows.test
+        solver.set_operator(P, M, None, Q)
+        dq, _ = solver.solve(Q.transpose(forms.product(M, self.problem.config.unknowns.vector(change))), 0.0)
+        return np.array(P.expand(solver.complete(dq)).array_r)[: self._n]
 
     def _settle(self) -> Any:
         """Correct the freely moved state by contact (collective)."""
