@@ -147,7 +147,7 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
     bodies, config = problem.bodies, problem.config
     bodies.assemble()
     left, n = bodies.forces.copy(), config.n_owned
-    rounding = 10 * first(problem.system.rounding())
+    rounding = 10 * max(first(problem.system.rounding()), bodies.rounding_of_displacement())
     for contact in problem.contacts:
         if not contact.on:
             assert contact.n_active == 0 and highest(config.comm, np.abs(contact.force.x.array)) <= 0.0

@@ -37,12 +37,12 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Adaptation", "Adhesion", "Balance", "Ball", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
-    "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Dynamics", "Elastic", "Energies",
-    "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError", "FrictionError",
-    "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "Leak", "LinearElastic",
-    "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton",
-    "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad",
-    "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results", "ResultsWriter", "RigidCoupling",
+    "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Deck", "Dynamics", "Elastic",
+    "Energies", "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError",
+    "FrictionError", "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "Leak",
+    "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError",
+    "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError",
+    "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results", "ResultsWriter", "RigidCoupling",
     "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "Slider", "SoftContact", "SpaceError",
     "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError",
     "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations",
@@ -50,8 +50,8 @@ __all__ = [
     "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh", "figure", "form", "function_space",
     "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
     "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
-    "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings",
-    "write_checkpoint",
+    "read_deck", "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing",
+    "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -132,6 +132,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.laws.thermal import OfTemperature
     from uem_dolfinx.contact.preload import Preload
+    from uem_dolfinx.decks.deck import Deck, read_deck
     from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
     from uem_dolfinx.dynamics.inertia import Dynamics
     from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
@@ -168,7 +169,7 @@ _LATER = {
     "Adhesion": "contact.laws.adhesion",
     "Leak": "contact.laws.leak",
     "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.mixed_mode", "Power": "contact.laws.mixed_mode",
-    "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files",
+    "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files", "read_deck": "decks.deck", "Deck": "decks.deck",
     "CentralDifferences": "dynamics.explicit.central_differences",
     "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",
     "lumped_mass": "dynamics.mass", "nodal_mass": "dynamics.mass",

@@ -13,7 +13,7 @@ from benchmarks.reference import compare, decks
 
 def test_every_scene_is_said_on_the_page():
     page = (compare.HERE / "README.md").read_text(encoding="utf-8")
-    assert len(compare.SCENES) == 16
+    assert len(compare.SCENES) == 20
     for scene in compare.SCENES:
         script = "decks.py" if "deck" in scene else f"../../{scene['demo']}.py"
         source = (compare.HERE / script).read_text(encoding="utf-8")

@@ -43,6 +43,25 @@ def test_bar_between_walls(cell, degree, coupling):
     assert highest(COMM, np.abs(b.u.x.array - found)) < 1e-14 and bolt.carried == pytest.approx(0.02, rel=1e-12)
 
 
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_shortened_between_walls(coupling):
+    """A given shortening takes the force of the closed form, in steps as well; a force in a later step lets the length go."""
+    b = blocks(COMM, "quadrilateral", 2, 4, degree=1)
+    bolt = uem.Preload(b.high, b.low, coupling=coupling, shortening=lambda s: 0.03 * s)
+    problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=b.oedometer(0.0), contacts=[bolt])
+    stiffness = M / (1 + 1 / 2)
+    for step in uem.load_steps(problem, 3):
+        assert bolt.carried == pytest.approx(stiffness * 0.03 * step.factor, rel=1e-11)
+        assert bolt.opening == pytest.approx(-0.03 * step.factor, rel=1e-14) and bolt.locked
+    for _ in uem.load_steps(problem, [uem.Step("pull", 2, preload={bolt: 0.05}), uem.Step("keep", preload={bolt: None})]):
+        pass
+    assert bolt.carried == pytest.approx(0.05, rel=1e-11) and bolt.locked
+    assert bolt.opening == pytest.approx(-0.05 / stiffness, rel=1e-11)
+    for how in ({}, {"force": 1.0, "shortening": 1.0}):
+        with pytest.raises(uem.InputError, match="expected one of them"):
+            uem.Preload(b.high, b.low, **how)
+
+
 class Joint:
     """Two bolts A and B and a sleeve between a floor and a plate, all in one place, each in one-dimensional strain.
 

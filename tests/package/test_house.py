@@ -21,6 +21,7 @@ ROOMS = [
     ("arrays", "errors", "compiled", "compat", "log", "parallel", "given", "files", "forms", "form_checks"), ("geometry",), ("algebra",),
     ("conditions",), ("contact",), ("materials", "dynamics"), ("restart",), ("solve",), ("gradients",), ("accuracy",), ("output",),
     ("scripting",),
+    ("decks",),
 ]  # fmt: skip
 #: Folders within contact/ from the ground up, and files of its own among them; ``""`` is all its other files.
 FLOORS = {

@@ -93,3 +93,44 @@ def grid(kind, order, n=2):
 def node_sets(sets):
     """Text of sets of nodes ``{name: nodes}``, which ``deck`` numbers."""
     return "".join(f"*NSET, NSET={name}\n" + "".join(f"{10 * (n + 1)}\n" for n in nodes) for name, nodes in sets.items())
+
+
+def columns(parts, kind="C3D8"):
+    """Text of columns of cells upon each other, each from one height to another in some cells, one cell wide, from 1 to 2 in 2D.
+
+    Nodes of level l of column k are 100 k + 10 l + 1, 2 ...; sets are ``body k``, ``foot k`` and ``head k``, surfaces ``under k`` and
+    ``over k``.
+    """
+    flat, square = not kind.startswith("C3D"), [(0, 0), (1, 0), (1, 1), (0, 1)]
+    across = [(1.0, None), (2.0, None)] if flat else square
+    nodes, cells, sets = [], [], []
+    for k, (low, high, n) in enumerate(parts, 1):
+        for level in range(n + 1):
+            z = low + (high - low) * level / n
+            places = [(x, z) if flat else (x, y, z) for x, y in across]
+            nodes += [f"{100 * k + 10 * level + i}, {', '.join(map(str, p))}" for i, p in enumerate(places, 1)]
+        for level in range(n):
+            below, above = ([100 * k + 10 * at + i for i in range(1, len(across) + 1)] for at in (level, level + 1))
+            cells.append((k, 10 * k + level, [*below, *(above[::-1] if flat else above)]))
+        ends = [", ".join(str(100 * k + 10 * level + i) for i in range(1, len(across) + 1)) for level in (0, n)]
+        sides = ("S1", "S3") if flat else ("S1", "S2")
+        sets += [f"*NSET, NSET=foot {k}", ends[0], f"*NSET, NSET=head {k}", ends[1]]
+        sets += [
+            f"*SURFACE, NAME=under {k}",
+            f"{10 * k}, {sides[0]}",
+            f"*SURFACE, NAME=over {k}",
+            f"{10 * k + n - 1}, {sides[1]}",
+        ]
+    lines = ["*NODE, NSET=all", *nodes]
+    for k in range(1, len(parts) + 1):
+        own = [f"{number}, {', '.join(map(str, at))}" for of, number, at in cells if of == k]
+        lines += [f"*ELEMENT, TYPE={kind}, ELSET=body {k}", *own]
+    return "\n".join([*lines, *sets]) + "\n"
+
+
+def written(folder, text, name="deck.inp"):
+    """The path of a file with this text."""
+    if COMM.rank == 0:
+        (folder / name).write_text(text, encoding="utf-8")
+    COMM.barrier()
+    return folder / name

@@ -182,6 +182,24 @@ def test_heat_closes_a_gap(coupling, unit):
     assert not pressed[0] and pressed[-1]
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e6])
+def test_a_field_that_changes_in_equilibrium(unit):
+    """Free expansion at large displacements in steps of time: forces vanish in every step, and Newton's steps are full."""
+    b = blocks(COMM, "quadrilateral", 2, 2)
+    f = fields(b, 1, 1)
+    (u, T), (v, q) = f.split(f.w), f.split(ufl.TestFunction(f.w.function_space))
+    old, law, alpha = fem.Function(f.w.function_space), uem.StVenantKirchhoff(unit, 0.3, kind="plane_strain"), 1e-4
+    F = (law.residual(u, v) - law.thermal_residual(u, v, alpha * T)) * ufl.dx
+    F += ((T - f.split(old)[1]) / 0.1 * q + ufl.inner(ufl.grad(T), ufl.grad(q))) * ufl.dx
+    ends = [uem.dirichlet(f.other, b.top, value=800.0)]
+    tie = uem.Contact(b.high, b.low, tied=True)
+    problem = uem.UnitedProblem(F, f.w, displacement=0, bcs=[*f.rollers(), *ends], contacts=[tie])
+    for _ in range(4):
+        history = problem.solve()
+        assert len(history) <= 7 and min(one.step_length for one in history) == 1.0
+        old.x.array[:] = f.w.x.array
+
+
 def test_every_field_is_solved_beside_the_largest_forces():
     """Heat that depends on its temperature is in balance to the accuracy asked for, beside forces 1e12 times as large."""
     b = blocks(COMM, "triangle", 3, 3)

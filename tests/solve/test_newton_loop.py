@@ -23,7 +23,7 @@ class OneUnknown:
     """``F(u) = 0`` whose first full step leaves a given part of the residual, all later ones none: bodies and ``ContactMethod`` in one."""
 
     exact, iterative, passing, fits, convex, in_contact = True, False, False, False, False, False
-    unknowns = SimpleNamespace(norms=PETSc.Vec.norm, work=PETSc.Vec.dot)
+    unknowns = SimpleNamespace(norms=PETSc.Vec.norm, work=PETSc.Vec.dot, mixed=False)
     most_past = np.inf
 
     def __init__(self, left):

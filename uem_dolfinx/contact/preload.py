@@ -1,4 +1,4 @@
-"""Preload: the opening of a bolt's section is an unknown with a given force, which is later locked."""
+"""Preload: the opening of a bolt's section is an unknown with a given force, which is later locked, or it is given itself."""
 
 from __future__ import annotations
 
@@ -41,12 +41,13 @@ class Preload(Contact):
         force: force in the section, positive in tension, of the modelled part: half of it for half a bolt, the full circle for
             axisymmetry. A number acts in full from the first step on; a function is called with the load factor, in time steps with
             the time.
+        shortening: instead of a force, by how much the bolt is shortened, a length, as by turning its nut; a number or such a function.
         coupling: see ``Contact``.
         measure: see ``Contact``.
         name: see ``Contact``.
 
     Raises:
-        InputError, InputTypeError: for an invalid axis or force, or a rigid target.
+        InputError, InputTypeError: for an invalid axis or force, none of force and shortening or both, or a rigid target.
     """
 
     def __init__(
@@ -55,7 +56,8 @@ class Preload(Contact):
         target: Part,
         axis: npt.ArrayLike | None = None,
         *,
-        force: float | Callable[[float], float],
+        force: float | Callable[[float], float] | None = None,
+        shortening: float | Callable[[float], float] | None = None,
         coupling: Literal["node_to_surface", "mortar"] | Callable[..., Discretisation] = "node_to_surface",
         measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
@@ -70,13 +72,17 @@ class Preload(Contact):
                 "hold a part of the bolt by Dirichlet conditions instead",
             )
             self._axis = None if axis is None else given.direction("axis", axis)
-            self._force = _given_force(force)
+            if (force is None) == (shortening is None):
+                raise InputError(f"force = {given.shown(force)}, shortening = {given.shown(shortening)}: expected one of them")
+            self._force = None if force is None else _given("force", force)
+            self._shortening = None if shortening is None else _given("shortening", shortening)
         super().__init__(contactor, target, coupling=coupling, tied=True, measure=measure, name=name)
 
     def __repr__(self) -> str:
         """Name, axis, force and coupling."""
         axis = "" if self._axis is None else f", axis={self._axis.tolist()}"
-        return f"Preload({self.name!r}{axis}, force={given.shown(self._force)}, coupling={self.coupling!r})"
+        led = f"force={given.shown(self._force)}" if self._shortening is None else f"shortening={given.shown(self._shortening)}"
+        return f"Preload({self.name!r}{axis}, {led}, coupling={self.coupling!r})"
 
     # -- for users -------------------------------------------------------------------------------------------------------
 
@@ -88,10 +94,10 @@ class Preload(Contact):
         """
         section = self._section
         with agreed(self.config.comm):
-            force = _given_force(force)
+            force = _given("force", force)
         given.alike(self.config.comm, self._words, force=force)
-        self._force = force
-        self._take_force()
+        self._force, self._shortening = force, None
+        self._take_lead()
         section.release()
 
     def lock(self) -> None:
@@ -147,10 +153,10 @@ class Preload(Contact):
                 given.direction(f"{self._words}: axis", self._axis, config.gdim)
                 if is_axisymmetric(config.mesh) and self._axis[0] != 0.0:
                     raise InputError(given.sentence(f"{self._words}: axis", self._axis, "the axis of symmetry, (0, 1)"))
-        given.alike(config.comm, self._words, force=self._force, axis=self._axis)
+        given.alike(config.comm, self._words, force=self._force, shortening=self._shortening, axis=self._axis)
         self._free = free
         super().attach(config, free, **clock)
-        self._take_force()
+        self._take_lead()
         return self.pair
 
     def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Preloaded:
@@ -164,22 +170,28 @@ class Preload(Contact):
         return False
 
     def take_load(self, at: float, known: bool = False) -> None:
-        """See ``Contact``; also updates the force (collective)."""
+        """See ``Contact``; also updates the force, or the shortening (collective)."""
         super().take_load(at, known)
-        if callable(self._force):
-            self._take_force()
+        if callable(self._force) or callable(self._shortening):
+            self._take_lead()
 
-    def _take_force(self) -> None:
-        """Set the force of the present load factor or time in the pair (collective)."""
-        force = self._force
-        if callable(force):
-            words = f"{self._words}: force({self._at:.6g})"
-            value = ask_together(self.config.comm, words, force, self._at)
-            with agreed(self.config.comm):
-                force = given.number(words, value)
-        self._section.force = force
+    def _take_lead(self) -> None:
+        """Set the force, or the shortening, of the present load factor or time in the pair (collective)."""
+        if self._shortening is not None:
+            self._section.shorten(self._now("shortening", self._shortening))
+        elif self._force is not None:
+            self._section.force = self._now("force", self._force)
+
+    def _now(self, what: str, of_load: Any) -> float:
+        """A number, or the present value of a function of the load factor (collective)."""
+        if not callable(of_load):
+            return float(of_load)
+        words = f"{self._words}: {what}({self._at:.6g})"
+        value = ask_together(self.config.comm, words, of_load, self._at)
+        with agreed(self.config.comm):
+            return float(given.number(words, value))
 
 
-def _given_force(force: Any) -> Any:
+def _given(what: str, value: Any) -> Any:
     """A number or a function of the load factor; refuse all else."""
-    return force if callable(force) else given.number("force", force)
+    return value if callable(value) else given.number(what, value)

@@ -136,7 +136,7 @@ def take_preload(bolt: Preload, force: Callable[[float], float] | None, known: b
     elif force is not None:
         bolt._at = 0.0
         if known:
-            bolt._force = force
+            bolt._force, bolt._shortening = force, None
         else:
             bolt.tighten(force)
 

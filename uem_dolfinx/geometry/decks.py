@@ -1,7 +1,7 @@
 """The mesh in an input file of Abaqus or CalculiX: nodes, elements, and sets of nodes, of elements and of their sides.
 
-The keywords ``*NODE``, ``*ELEMENT``, ``*NSET``, ``*ELSET``, ``*SURFACE`` and ``*INCLUDE`` are read. Other keywords are skipped,
-except keywords that create nodes or elements, which are refused.
+The keywords ``*NODE``, ``*ELEMENT``, ``*NSET``, ``*ELSET``, ``*SURFACE`` and ``*INCLUDE`` are read. Keywords that create nodes or
+elements are refused, and all others are kept as they stand, for ``uem_dolfinx.decks``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -43,6 +43,10 @@ NODES_OF = {"line": 2, "line3": 3} | {
 }
 
 
+#: A keyword and its options in capitals, and its data rows.
+Card: TypeAlias = tuple[str, dict[str, str], list[list[str]]]
+
+
 @dataclass
 class Deck:
     """Data read from a file, by its numbers and names; names of sets are case-insensitive.
@@ -54,6 +58,9 @@ class Deck:
         surfaces: names, whether of elements, and pairs of a member and a side.
         left_out: number of elements of each type that is not part of a body; ``others`` are the numbers of these elements.
         parts: numbers of parts and of instances.
+        types: types of the elements that are parts of bodies.
+        cards: keywords that are no part of the mesh, in order, with options and rows.
+        loaded: names of sets of nodes that are points, even if they have all nodes of facets.
     """
 
     nodes: dict[int, list[float]] = field(default_factory=dict)
@@ -64,14 +71,22 @@ class Deck:
     left_out: dict[str, int] = field(default_factory=dict)
     others: set[int] = field(default_factory=set)
     parts: dict[str, int] = field(default_factory=dict)
+    types: set[str] = field(default_factory=set)
+    cards: list[Card] = field(default_factory=list)
+    loaded: set[str] = field(default_factory=set)
 
 
-def read_deck(path: Path) -> Found:
+def read_found(path: Path) -> Found:
     """Read the mesh of an input file.
 
     Raises:
         MeshError: if the file cannot be read.
     """
+    return found_of(read_numbers(path), path)
+
+
+def read_numbers(path: Path) -> Deck:
+    """Read the numbers and names of an input file; MeshError if it cannot be read."""
     deck = Deck()
     for keyword, options, rows in _keywords(path):
         try:
@@ -85,6 +100,11 @@ def read_deck(path: Path) -> Found:
     if deck.left_out:
         what = ", ".join(f"{n} of type {name}" for name, n in deck.left_out.items())
         logger.info("%s: elements that are no part of a body are left out: %s", path, what)
+    return deck
+
+
+def found_of(deck: Deck, path: Path) -> Found:
+    """The mesh of a deck, without its numbers; MeshError for sets and surfaces of what does not exist."""
     try:
         return _found(deck)
     except (KeyError, ValueError) as error:
@@ -164,6 +184,8 @@ def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str
     elif keyword == "SURFACE":
         of_elements = options.get("TYPE", "ELEMENT").upper() == "ELEMENT"
         deck.surfaces[options["NAME"]] = (of_elements, [[*row, ""][:2] for row in rows])
+    elif keyword:
+        deck.cards.append((keyword, options, rows))
 
 
 def _generated(first: int, last: int, step: int = 1) -> range:
@@ -214,6 +236,7 @@ def _elements(deck: Deck, options: dict[str, str], lines: list[list[str]]) -> No
         if "ELSET" in options:
             _named(deck.elsets, options["ELSET"]).extend(numbers)
         return
+    deck.types.add(name)
     width, numbers = NODES_OF[kind] + 1, [int(value) for line in lines for value in line if value]
     if len(numbers) % width:
         raise ValueError(f"{len(numbers)} numbers are no whole number of elements with {width - 1} nodes")
@@ -246,7 +269,8 @@ def _found(deck: Deck) -> Found:
         name: _places(numbers, np.unique(members).astype(np.int64), "node", f"the set of nodes '{name}' holds")
         for name, members in deck.nsets.values()
     }
-    found = Found(np.array([deck.nodes[n] for n in numbers.tolist()]), cells, cell_sets, point_sets)
+    points = np.array([deck.nodes[n] for n in numbers.tolist()])
+    found = Found(points, cells, cell_sets, point_sets, as_points=frozenset(deck.loaded))
     sides = _Sides(found, of_kind)
     for name, (of_elements, rows) in deck.surfaces.items():
         if of_elements:

@@ -111,6 +111,7 @@ class Found:
         point_sets: nodes of each set, by name.
         sides: vertices of the facets of each surface, one array for each number of vertices, by name.
         cell_data: integers of cells, in every block, by name.
+        as_points: names of sets of nodes that are points, even if they have all nodes of facets.
     """
 
     points: Array
@@ -119,6 +120,7 @@ class Found:
     point_sets: dict[str, Ints] = field(default_factory=dict)
     sides: dict[str, list[Ints]] = field(default_factory=dict)
     cell_data: dict[str, list[Ints]] = field(default_factory=dict)
+    as_points: frozenset[str] = frozenset()
 
     @property
     def dim(self) -> int:

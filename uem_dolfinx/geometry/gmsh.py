@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,9 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
 from uem_dolfinx.geometry.cells import check_edges, check_nodes, check_volumes
+from uem_dolfinx.geometry.cuts import cut_along
 from uem_dolfinx.geometry.mesh_sizes import MeshSizes
+from uem_dolfinx.geometry.raw import Group, RawMesh
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
@@ -63,6 +64,8 @@ def read_gmsh(
     gdim: int | None = None,
     parameters: Mapping[str, float] | None = None,
     size: MeshSizes | None = None,
+    *,
+    cut: str | Sequence[str] = (),
 ) -> tuple[Any, Tags]:
     """Read a mesh and its physical groups from Gmsh (collective).
 
@@ -76,6 +79,8 @@ def read_gmsh(
         gdim: geometric dimension, 2 or 3; by default that of the model. The coordinate ``z`` is dropped in 2D.
         parameters: numbers for the ``.geo`` file's ``DefineConstant``.
         size: sizes of cells instead of those of the ``.geo`` file, as ``adapt`` passes them to its ``make``; None keeps the file's.
+        cut: name of a plane group of facets that divides a body, or several: nodes are doubled there, the group is one face, and
+            ``"name back"`` is the other one, as a section of a bolt needs.
 
     Returns:
         The mesh and its tags.
@@ -93,7 +98,7 @@ def read_gmsh(
         for name, value in (parameters or {}).items():
             given.number(f"parameters[{name!r}]", value, given.Range("a finite number", lambda x: True))
         given.kind("size", size, size is None or isinstance(size, MeshSizes), "what adapt passes to make, or None")
-        return _read(source, gdim, dict(parameters or {}), size)
+        return cut_along(_read(source, gdim, dict(parameters or {}), size), cut)
 
     return distributed(comm, read, source if isinstance(source, (str, Path)) else "gmsh model")
 
@@ -123,32 +128,6 @@ def distributed(comm: MPI.Comm, read: Callable[[], RawMesh], label: Any) -> tupl
 
 
 # ---------------------------------------------------------------------------------------------- on rank 0
-
-
-@dataclass(frozen=True)
-class Group:
-    """A physical group, or a set of another program.
-
-    Its ``rows`` are, for the bodies, the input index of their cells, shape ``(n,)``; else the vertices of each entity as ascending
-    input node index, shape ``(n, n_vertices)``. Of a set of nodes its ``middles`` are those that are no vertices, shape ``(m,)``.
-    """
-
-    name: str | None
-    number: int
-    dim: int
-    rows: npt.NDArray[np.int64]
-    middles: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-
-@dataclass(frozen=True)
-class RawMesh:
-    """A whole mesh on one rank: ``points (n_nodes, gdim)``, and ``cells (n_cells, n_nodes_per_cell)`` of nodes in Gmsh's order."""
-
-    cell: str
-    degree: int
-    points: npt.NDArray[np.float64]
-    cells: npt.NDArray[np.int64]
-    groups: list[Group]
 
 
 def _read(source: Any, gdim: int | None, parameters: dict[str, float], size: MeshSizes | None = None) -> RawMesh:

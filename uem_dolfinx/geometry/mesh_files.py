@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -16,8 +16,10 @@ import numpy as np
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
+from uem_dolfinx.geometry.cuts import cut_along
 from uem_dolfinx.geometry.found import KINDS, Found, from_meshio
-from uem_dolfinx.geometry.gmsh import Group, RawMesh, checked, distributed, read_gmsh
+from uem_dolfinx.geometry.gmsh import checked, distributed, read_gmsh
+from uem_dolfinx.geometry.raw import Group, RawMesh
 from uem_dolfinx.geometry.serendipity import completed
 from uem_dolfinx.geometry.tags import Tags
 from uem_dolfinx.log import logger
@@ -32,7 +34,9 @@ MESHIO_CELLS = {
 MESHIO_VERTICES = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
 
 
-def read_mesh(path: str | Path, comm: MPI.Comm, gdim: int | None = None, *, cells: str | None = None) -> tuple[Any, Tags]:
+def read_mesh(
+    path: str | Path, comm: MPI.Comm, gdim: int | None = None, *, cells: str | None = None, cut: str | Sequence[str] = ()
+) -> tuple[Any, Tags]:
     """Read a mesh file and its sets (collective).
 
     Files of Gmsh, ``.geo`` and ``.msh``, are read as ``read_gmsh`` does; input files ``.inp`` of Abaqus and CalculiX with their sets and
@@ -50,6 +54,7 @@ def read_mesh(path: str | Path, comm: MPI.Comm, gdim: int | None = None, *, cell
         gdim: geometric dimension, 2 or 3; by default that of the cells. The coordinate ``z`` is dropped in 2D.
         cells: ``"simplices"`` divides quadrilaterals into triangles, and hexahedra, prisms and pyramids into tetrahedra, of the same
             order, as meshes of several kinds of cells need; None leaves them.
+        cut: names of plane surfaces inside bodies along which these are cut, see ``read_gmsh``.
 
     Returns:
         The mesh and its tags.
@@ -66,20 +71,25 @@ def read_mesh(path: str | Path, comm: MPI.Comm, gdim: int | None = None, *, cell
         cells = given.word("cells", cells, ("simplices",))
     file = Path(path).expanduser().absolute()
     if file.suffix in (".geo", ".msh") and cells is None:
-        return read_gmsh(path, comm, gdim)
-    return distributed(comm, lambda: _read(file, gdim, cells is not None), path)
+        return read_gmsh(path, comm, gdim, cut=cut)
+    return distributed(comm, lambda: cut_along(_read(file, gdim, cells is not None), cut), path)
 
 
 # ---------------------------------------------------------------------------------------------- on rank 0
 
 
 def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
-    """The whole mesh, with numbers for all nodes that belong to cells."""
+    """The whole mesh of a file."""
     if path.suffix == ".geo":
         raise MeshError(f"cells = 'simplices' is for meshes, and {path} is not meshed: leave it out, and recombine nothing")
     if not path.is_file():
         raise MissingFileError(f"mesh file {path} does not exist")
-    found, added = completed(_found(path))
+    return raw_of(_found(path), path, gdim, simplices)
+
+
+def raw_of(found: Found, path: Path, gdim: int | None = None, simplices: bool = False) -> RawMesh:
+    """The whole mesh of the contents of a file, with numbers for all nodes that belong to cells."""
+    found, added = completed(found)
     if added:
         logger.info(
             "%s: serendipity cells are made complete by %d nodes in the middle of quadrilaterals and hexahedra", path, added
@@ -118,15 +128,15 @@ def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
         *_sets_of_nodes(found, place, raw, nodes < len(found.points) - added),
     ]
     raw.groups.extend(replace(group, number=number) for number, group in enumerate(sets, 1))
-    return raw
+    return replace(raw, of_file=nodes)
 
 
 def _found(path: Path) -> Found:
     """Content of the file."""
     if path.suffix.lower() == ".inp":
-        from uem_dolfinx.geometry.decks import read_deck
+        from uem_dolfinx.geometry.decks import read_found
 
-        return read_deck(path)
+        return read_found(path)
     try:
         import meshio
     except ImportError as error:
@@ -195,7 +205,7 @@ def _sets_of_nodes(found: Found, place: Ints, raw: RawMesh, of_file: Bools) -> I
         rows, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
         off = inside & of_file
         off[sides[first[count == 1]]] = False
-        if (count == 1).any() and not off.any():
+        if (count == 1).any() and not off.any() and name not in found.as_points:
             yield Group(name, 0, found.dim - 1, rows[count == 1])
         else:
             yield Group(name, 0, 0, np.flatnonzero(inside & is_vertex)[:, None], np.flatnonzero(inside & ~is_vertex))

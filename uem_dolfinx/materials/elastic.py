@@ -98,6 +98,15 @@ class Elastic(ABC):
         """Internal virtual work per reference volume, to be integrated with ``dx``."""
         return ufl.inner(self.first_piola(u), displacement_gradient(v))
 
+    def thermal_residual(self, u: Any, v: Any, strain: Any) -> Expr:
+        """Virtual work per reference volume of the stress that a free strain, alpha times the heating, takes away: subtract it.
+
+        ``law.residual(u, v) - law.thermal_residual(u, v, alpha * (T - T0))``: for small strains of heating, also with large rotations.
+        """
+        identity = self._check(u)
+        modulus = 2 * self.mu + (2 * self.lam_in_plane if self.kind == "plane_stress" else 3 * self.lam)
+        return ufl.inner(self._first_piola(u, modulus * strain * identity), displacement_gradient(v))
+
     def residual_form(self, u: fem.Function, v: Any, dx: ufl.Measure = ufl.dx) -> ufl.Form:
         """Internal virtual work of nearly incompressible bodies, without locking as nu approaches 1/2.
 

@@ -2,8 +2,8 @@
 
 python3 demos/benchmarks/reference/decks.py --deck test/cubesmortar.inp --json figures.json
 
-The name of the file tells the scene. Meshes, sets and surfaces are read from it; materials, conditions and loads, which stand in it too,
-are written here in UFL.
+The name of the file tells the scene. Meshes, sets and surfaces are read from it. Some decks are run with all that stands in them; for
+the others materials, conditions and loads are written here in UFL.
 """
 
 from __future__ import annotations
@@ -105,12 +105,28 @@ def tied_beam(path: Path) -> dict[str, Any]:
     return {f"frequency_{i}": float(f) for i, f in enumerate(found, 1)}
 
 
+def as_it_stands(wanted: dict[str, tuple[int, int]]) -> Callable[[Path], dict[str, Any]]:
+    """A deck with all that stands in it: components of displacements of nodes after its last step, by names."""
+
+    def run(path: Path) -> dict[str, Any]:
+        deck = uem.read_deck(path, comm)
+        for _ in deck.run():
+            pass
+        return {name: float(deck.displacement(node)[component]) for name, (node, component) in wanted.items()}
+
+    return run
+
+
 #: Scenes by the names of their files.
 SCENES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "08_lame_cax8.inp": thick_tube,
     "c3d15.inp": prisms,
     "cubesmortar.inp": two_cubes,
     "beamptied7.inp": tied_beam,
+    "contact2.inp": as_it_stands({"end": (494, 1)}),
+    "contact3.inp": as_it_stands({"raised": (9, 2)}),
+    "ring1.inp": as_it_stands({"inside": (10, 0), "outside": (3, 0)}),
+    "ring2.inp": as_it_stands({"outer": (13, 0), "inner": (6, 0)}),
 }
 
 

@@ -224,6 +224,10 @@ class Preloaded(Tie):
         self.find_opening()
         self.locked, self._here = True, None
 
+    def shorten(self, length: float) -> None:
+        """Lock the opening that shortens the bolt by a ``length``."""
+        self.locked, self.opening, self._here = True, -length, None
+
     def release(self) -> None:
         """Make the opening free."""
         self.locked, self._here = False, None

@@ -7,12 +7,38 @@ that neither a rigid translation nor a temperature far from zero makes an equati
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+from petsc4py import PETSc
+
+from uem_dolfinx import forms
+from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.fields import Unknowns
 from uem_dolfinx.geometry.nodes import Halo
+from uem_dolfinx.solve.bodies.norms import first
 from uem_dolfinx.solve.bodies.tangent import Tangent
+
+
+def driving(bodies: Any, test: Restriction, rhs: PETSc.Vec, du: PETSc.Vec) -> float:
+    """Norm of the forces that drive the displacement: right-hand side, and forces of increments of other fields (collective).
+
+    Where only another field changes, as a temperature in equilibrium, the right-hand side of the displacement vanishes.
+
+    Args:
+        bodies: ``Bodies`` with the tangent of the linearised problem.
+        test: Q.
+        rhs: of the linearised problem.
+        du: its solution.
+    """
+    unknowns = bodies.unknowns
+    own = first(unknowns.norms(rhs))
+    if not unknowns.mixed:
+        return own
+    others = du.copy()
+    others.array[unknowns.field == 0] = 0.0
+    return max(own, first(unknowns.norms(test.transpose(forms.product(bodies.tangent.K, others)))))
 
 
 class FieldScales:

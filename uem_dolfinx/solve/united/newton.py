@@ -19,6 +19,7 @@ from uem_dolfinx.arrays import Ints
 from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
 from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
+from uem_dolfinx.solve.bodies.field_scales import driving
 from uem_dolfinx.solve.bodies.norms import Norm, first, ratio, runs_away, worst
 from uem_dolfinx.solve.rigid.unheld import no_precision, unheld
 
@@ -389,7 +390,8 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
     start, state, dq = bodies.displacement(), problem.state, step.dq
     work_of, norms = bodies.unknowns.work, bodies.unknowns.norms
     # the residual is the negative right-hand side at first
-    work, norm, length = -work_of(dq, step.rhs), first(norms(step.rhs)), step.longest
+    norm = driving(bodies, state.test, step.rhs, step.du)
+    work, length = -work_of(dq, step.rhs), step.longest
     while True:
         last = not line_search or length <= SHORTEST_SEARCH
         if _moved(bodies, method, start, step, length):

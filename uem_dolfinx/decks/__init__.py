@@ -1,0 +1,1 @@
+"""Models of Abaqus and CalculiX, from their input files."""

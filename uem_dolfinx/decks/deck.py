@@ -1,0 +1,372 @@
+"""Decks of Abaqus and CalculiX as problems: their bodies, conditions, contacts and steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from uem_dolfinx import compat, given
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.conditions.at_points import PointLoad
+from uem_dolfinx.conditions.equation import Equation
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.general.general import GeneralContact
+from uem_dolfinx.contact.laws.conductance import Conductance
+from uem_dolfinx.contact.laws.exponential import Exponential
+from uem_dolfinx.contact.laws.soft import SoftContact
+from uem_dolfinx.contact.preload import Preload
+from uem_dolfinx.decks.model import TEMPERATURE, Interaction, Model, Pair, Step, model_of
+from uem_dolfinx.errors import InputError, MissingFileError, TagError
+from uem_dolfinx.geometry.axisymmetry import axisymmetric
+from uem_dolfinx.geometry.cuts import BACK, cut
+from uem_dolfinx.geometry.decks import found_of, read_numbers
+from uem_dolfinx.geometry.gmsh import distributed
+from uem_dolfinx.geometry.mesh_files import raw_of
+from uem_dolfinx.geometry.raw import RawMesh
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.log import logger
+from uem_dolfinx.materials.elastic import Elastic, LinearElastic, StVenantKirchhoff
+from uem_dolfinx.output.xdmf import geometry_degree
+from uem_dolfinx.parallel import reduced
+from uem_dolfinx.scripting import dirichlet, ds, dx
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.steps.load_step import LoadStep
+from uem_dolfinx.solve.steps.load_steps import load_steps
+from uem_dolfinx.solve.steps.step import Step as OfUsers
+
+#: Kinds of strains by the first letters of element types.
+STRAINS = {"C3D": "3d", "CPE": "plane_strain", "CPS": "plane_stress", "CAX": "axisymmetric"}
+#: Gaps up to this part of the model's size conduct heat: conductances of decks act before surfaces press.
+#: [convention; size of the model; test_deck_laws.py::test_gaps_that_conduct]
+CONDUCTS = 1e-4
+#: Steps of time of heat grow by this factor, up to a tenth of the step's duration.
+#: [convention; length of the step of time before; test_deck_laws.py::test_heat_in_steps_of_time]
+LONGER = 1.5
+#: Steps that are longer by less than this part are equally long.
+#: [convention; length of the step; test_deck_laws.py::test_heat_in_steps_of_time]
+SAME_LENGTH = 1e-6
+#: Number of steps of time of the greatest length.
+#: [convention; duration of the step; test_deck_laws.py::test_heat_in_steps_of_time]
+LEAST_STEPS = 10
+
+
+class Deck(given.Sealed):
+    """A model read by ``read_deck``.
+
+    Attributes:
+        mesh: the mesh.
+        tags: its sets and surfaces; nodes with conditions are among them, as ``"node 14"``.
+        u: displacement, or the Function of displacement and temperature.
+        problem: the problem.
+        contacts: by the names of their surfaces, ``"slave on master"``.
+        sections: preloaded sections of bolts by the names of their surfaces.
+        steps: data of the steps.
+        left_out: keywords and options without counterpart, or that are taken otherwise than they stand.
+    """
+
+    def __init__(self, mesh: Any, tags: Any, model: Model, numbers: Ints | None, soft: bool):
+        self.mesh, self.tags, self.steps, self.left_out = mesh, tags, model.steps, model.left_out
+        self._model, self._numbers, self._soft = model, numbers, soft
+        self._by_name = {str(tag.name).upper(): tag for tag in map(tags.__getitem__, tags) if tag.name}
+        kinds = {STRAINS.get(name[:3], "") for name in model.types}
+        if len(kinds) != 1 or "" in kinds:
+            raise InputError(f"elements are of the types {sorted(model.types)}: expected one family of {', '.join(STRAINS)}")
+        (self._kind,) = kinds
+        if self._kind == "axisymmetric":
+            axisymmetric(mesh)
+        #: Values that steps change, at the start, and at the ends of all steps.
+        self._driven: list[tuple[Array, Array, list[Any]]] = []
+        self._dt = fem.Constant(mesh, 1.0)
+        g, degree = mesh.geometry.dim, geometry_degree(mesh)
+        V = (
+            compat.function_space(mesh, [("Lagrange", degree, (g,)), degree])
+            if model.thermal
+            else compat.function_space(mesh, degree, (g,))
+        )
+        self.u = fem.Function(V, name="u")
+        self._old = fem.Function(V)
+        self.contacts = {f"{pair.slave} on {pair.master}": self._contact(pair) for pair in model.pairs}
+        self.sections = {name: self._section(name, node, axis) for name, node, axis in model.pretension}
+        held = dict.fromkeys(where for step in model.steps for where in step.held if not self._is_reference(where[0]))
+        self._bcs = {where: self._condition(where) for where in held}
+        self.problem = UnitedProblem(
+            self._residual(),
+            self.u,
+            displacement=0 if model.thermal else None,
+            bcs=self._held(model.steps[0]),
+            contacts=[*self.contacts.values(), *self.sections.values()],
+            equations=[self._equation(terms) for terms in model.equations],
+            points=self._point_loads(),
+        )
+
+    def __repr__(self) -> str:
+        """Its steps and contacts."""
+        kinds = ", ".join(step.kind.lower() for step in self.steps)
+        return f"Deck(steps: {kinds}; contacts: {', '.join(self.contacts) or 'none'}; {len(self.left_out)} keywords left out)"
+
+    # -- for users -------------------------------------------------------------------------------------------------------
+
+    def run(self) -> Iterator[LoadStep]:
+        """Take all steps, one converged load step or step of time after the other (collective); errors as of ``load_steps``."""
+        yield from load_steps(self.problem, [one for k, step in enumerate(self.steps) for one in self._stages(k, step)])
+
+    def displacement(self, node: int) -> Array:
+        """Displacement of a node of the file by its number ``(gdim,)`` (collective); InputError if no body has this node."""
+        return self._at(node)[: self.mesh.geometry.dim]
+
+    def temperature(self, node: int) -> float:
+        """Unknown temperature of a node of the file by its number (collective); InputError without such a node, or temperatures."""
+        if not self._model.thermal:
+            raise InputError("temperature: the deck has no unknown temperatures: expected a step of heat")
+        return float(self._at(node)[-1])
+
+    def _at(self, node: int) -> Array:
+        """Displacement, and temperature if it is unknown, of a node (collective)."""
+        comm, mesh, config = self.mesh.comm, self.mesh, self.problem.config
+        place = comm.bcast(None if self._numbers is None else np.flatnonzero(self._numbers == node), root=0)
+        if not len(place):
+            raise InputError(f"node = {node}: no body of the deck has this node")
+        at = np.argwhere(np.isin(mesh.geometry.input_global_indices, place[:1])[compat.geometry_dofs(mesh)])
+        found = None
+        if len(at):
+            cell, i = at[0]
+            found = config.displacement[compat.cell_dofs(config.V)[cell, i]]
+            if self._model.thermal:
+                found = np.append(found, self.u.x.array[compat.part_dofs(self.u.function_space, 1)[cell, i]])
+        return np.asarray(next(one for one in comm.allgather(found) if one is not None))
+
+    # -- steps -----------------------------------------------------------------------------------------------------------
+
+    def _stages(self, k: int, step: Step) -> Iterator[OfUsers]:
+        """A step in static load steps, or in steps of time."""
+        bcs, changed = self._held(step), dict[Contact | GeneralContact, bool]()
+        for pair, contact in zip(self._model.pairs, self.contacts.values()):
+            if (key := (pair.slave.upper(), pair.master.upper())) in step.contacts:
+                changed[contact] = step.contacts[key]
+        if step.kind == "STATIC" or step.steady:
+            n = int(np.ceil(step.duration / step.first - SAME_LENGTH))
+            yield OfUsers(f"step {k + 1}", n, bcs=bcs, contacts=changed, loads=self._loads(k, 0.0), begin=self._pass(np.inf))
+            return
+        time, dt = 0.0, step.first
+        while time < step.duration:
+            dt = min(dt, step.duration / LEAST_STEPS)
+            end = time + dt if time + (1.0 + SAME_LENGTH) * dt < step.duration else step.duration
+            # conditions of heat act in full from the beginning
+            yield OfUsers(f"step {k + 1}", bcs=bcs, contacts=changed, loads=self._loads(k, 1.0), begin=self._pass(end - time))
+            time, dt, changed = end, dt * LONGER, {}
+
+    def _pass(self, dt: float) -> Callable[[], None]:
+        """What begins a step of time."""
+
+        def begin() -> None:
+            self._dt.value = dt
+            self._old.x.array[:] = self.u.x.array
+
+        return begin
+
+    def _loads(self, k: int, start: float) -> Callable[[float], None]:
+        """Loads of step k from a part of its changes on."""
+
+        def loads(s: float) -> None:
+            share = start + s * (1.0 - start)
+            for driven, first, values in self._driven:
+                before = values[k - 1] if k else first
+                driven[...] = before + share * (values[k] - before)
+
+        return loads
+
+    def _drive(self, driven: Array, values: list[Any]) -> None:
+        """Let an array follow values at the ends of the steps."""
+        self._driven.append((driven, np.array(driven), values))
+
+    def _driven_by(self, what: str, where: Any) -> fem.Constant:
+        """A Constant that follows a value of the steps, which is 0 where a step has none."""
+        constant = fem.Constant(self.mesh, 0.0)
+        self._drive(constant.value, [getattr(step, what).get(where, 0.0) for step in self.steps])
+        return constant
+
+    # -- parts of the model ----------------------------------------------------------------------------------------------
+
+    def _tag(self, name: str) -> Tag:
+        if name.upper() not in self._by_name:
+            raise TagError(f"the deck mentions '{name}', which has no node or side of a body: {self.tags!r}")
+        return self._by_name[name.upper()]
+
+    def _is_reference(self, where: str) -> bool:
+        return any(where == f"node {int(node)}" for _, node, _ in self._model.pretension)
+
+    def _condition(self, where: tuple[str, int]) -> fem.DirichletBC:
+        (name, dof), V = where, self.u.function_space
+        if dof == TEMPERATURE:
+            return dirichlet(V.sub(1), self._tag(name), None, self._driven_by("held", where))
+        return dirichlet(V.sub(0) if self._model.thermal else V, self._tag(name), dof - 1, self._driven_by("held", where))
+
+    def _held(self, step: Step) -> list[fem.DirichletBC]:
+        return [self._bcs[where] for where in step.held if where in self._bcs]
+
+    def _equation(self, terms: list[tuple[str, int, float]]) -> Equation:
+        axes = np.eye(self.mesh.geometry.dim)
+        return Equation([(self._tag(name), c * axes[dof - 1]) for name, dof, c in terms])
+
+    def _point_loads(self) -> list[PointLoad]:
+        g, found = self.mesh.geometry.dim, []
+        for name in dict.fromkeys(name for step in self.steps for name, _ in step.forces if not self._is_reference(name)):
+            force = fem.Constant(self.mesh, np.zeros(g))
+            self._drive(force.value, [np.array([s.forces.get((name, c), 0.0) for c in range(1, g + 1)]) for s in self.steps])
+            found.append(PointLoad(self._tag(name), force))
+        return found
+
+    def _section(self, name: str, node: str, axis: list[float]) -> Preload:
+        g, reference, now = self.mesh.geometry.dim, (f"node {int(node)}", 1), np.zeros(1)
+        pulled = any(reference in step.forces for step in self.steps)
+        self._drive(now, [(step.forces if pulled else step.held).get(reference, 0.0) for step in self.steps])
+        led: dict[str, Any] = {"force" if pulled else "shortening": lambda s: float(now[0])}
+        direction = axis[:g] if any(axis[:g]) else None
+        return Preload(self._tag(name), self._tag(BACK.format(name)), direction, coupling="mortar", name=name, **led)
+
+    def _contact(self, pair: Pair) -> Contact:
+        law, name = self._model.interactions.get(pair.interaction, Interaction()), f"{pair.slave} on {pair.master}"
+        slave, master = self._tag(pair.slave), self._tag(pair.master)
+        how: dict[str, Any] = {"coupling": "mortar" if pair.surfaces and slave.dim else "node_to_surface", "name": name}
+        how |= {} if pair.adjust is None else {"adjust": pair.adjust or False}
+        if pair.tied or law.overclosure == "TIED":
+            return Contact(slave, master, tied=True, **how)
+        how |= {"sliding": "small"} if pair.small else {}
+        how |= {"friction": law.friction} if law.friction else {}
+        if self._soft and law.numbers:
+            how["normal"] = _soft(law)
+        elif law.overclosure != "HARD":
+            self.left_out.append(f"PRESSURE-OVERCLOSURE={law.overclosure} of '{name}': contact is hard")
+        if law.conductance and self._model.thermal:
+            x, h = self.mesh.geometry.x, law.conductance[0][0]
+            ends = [reduced(self.mesh.comm, f(sign * x, axis=0), op=MPI.MAX) for sign, f in ((1.0, np.max), (-1.0, np.max))]
+            near = CONDUCTS * float(np.linalg.norm(ends[0] + ends[1]))
+            how["heat"] = Conductance(lambda p, g: np.where(g <= near, h, 0.0), field=1)
+        return Contact(slave, master, **how)
+
+    # -- the form --------------------------------------------------------------------------------------------------------
+
+    def _residual(self) -> ufl.Form:
+        """Internal minus external virtual work of all sections, with their heat."""
+        thermal, test = self._model.thermal, ufl.TestFunction(self.u.function_space)
+        w, T = ufl.split(self.u) if thermal else (self.u, None)
+        v, q = ufl.split(test) if thermal else (test, None)
+        law_of = StVenantKirchhoff if any(step.nlgeom for step in self.steps) else LinearElastic
+        F, heating = 0, self._heating(T)
+        for elements, name in self._model.sections:
+            material, cells = self._model.materials[name], dx(self._tag(elements)) if len(self._model.sections) > 1 else ufl.dx
+            if material.elastic is None:
+                raise InputError(f"material '{name}' has no *ELASTIC: expected E and nu of an isotropic material")
+            law = law_of(*material.elastic, kind=self._kind)  # type: ignore[arg-type]
+            F += law.residual_form(self.u, v, cells) if not thermal and self._locks(law) else law.residual(w, v) * cells
+            if material.expansion and heating is not None:
+                F -= law.thermal_residual(w, v, material.expansion * heating) * cells
+            if thermal:
+                stored = material.density * material.heat_capacity * (T - ufl.split(self._old)[1]) / self._dt
+                F += ((material.conductivity or 0.0) * ufl.inner(ufl.grad(T), ufl.grad(q)) + stored * q) * cells
+        for where in dict.fromkeys(where for step in self.steps for where in step.pressures):
+            pressed = self._driven_by("pressures", where) * ufl.dot(ufl.FacetNormal(self.mesh), v)
+            F += pressed * ds(self._tag(where[0]))
+        return F
+
+    def _locks(self, law: Elastic) -> bool:
+        """Whether CalculiX' elements of this type integrate the change of volume with fewer points."""
+        cell, degree = compat.cell_name(self.mesh), geometry_degree(self.mesh)
+        return degree == 1 and cell in ("quadrilateral", "hexahedron") and law.kind in ("3d", "plane_strain")
+
+    def _heating(self, T: Any) -> Any:
+        """Temperatures above those at the start, linear in cells where they are prescribed; None if they play no part."""
+        if self._model.thermal and all(step.kind == "HEAT TRANSFER" for step in self.steps):
+            return None
+        V = compat.function_space(self.mesh, 1)
+        start = fem.Function(V)
+        self._warm(start, self._model.initial)
+        if self._model.thermal:
+            self.u.sub(1).interpolate(start)
+            return T - start
+        if not any(step.temperatures for step in self.steps):
+            return None
+        now = fem.Function(V)
+        now.x.array[:] = start.x.array
+        values = []
+        for step in self.steps:
+            there = fem.Function(V)
+            there.x.array[:] = start.x.array
+            self._warm(there, step.temperatures)
+            values.append(np.array(there.x.array))
+        self._drive(now.x.array, values)
+        return now - start
+
+    def _warm(self, field: fem.Function, temperatures: dict[str, float]) -> None:
+        """Set temperatures at the nodes of sets (collective)."""
+        for name, value in temperatures.items():
+            field.x.array[compat.bc_dofs(dirichlet(field.function_space, self._tag(name)))[0]] = value
+        field.x.scatter_forward()
+
+
+def _soft(law: Interaction) -> SoftContact:
+    """The law of pressure of an interaction; InputError for another word than those of CalculiX."""
+    first, *rest = law.numbers[0]
+    if law.overclosure == "LINEAR":
+        return SoftContact(first)
+    if law.overclosure == "EXPONENTIAL":
+        # the pressure at c0 is a hundredth of p0
+        return SoftContact(Exponential(p0=rest[0], h=first / np.log(100.0)))
+    if law.overclosure == "TABULAR":
+        return SoftContact(sorted((-overclosure, p) for p, overclosure in law.numbers))
+    raise InputError(f"PRESSURE-OVERCLOSURE = {law.overclosure}: expected HARD, LINEAR, EXPONENTIAL, TABULAR or TIED")
+
+
+def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
+    """Read a deck of Abaqus or CalculiX with its materials, conditions, contacts, steps and loads as a problem (collective).
+
+        deck = uem.read_deck("ring1.inp", comm)
+        for step in deck.run():
+            print(step, deck.displacement(10))
+
+    Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
+    ``*BOUNDARY``, ``*CLOAD``, pressures by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``, ``*CONTACT PAIR``, ``*TIE``,
+    ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*MODEL CHANGE`` of contact pairs and ``*PRE-TENSION SECTION``, whose surface is cut; steps
+    ``*STATIC``, ``*HEAT TRANSFER`` and ``*COUPLED TEMPERATURE-DISPLACEMENT``. All else is in ``left_out`` and in the log.
+
+    Args:
+        path: of the input file.
+        comm: communicator of the mesh; rank 0 reads the file.
+        soft: False takes surfaces as hard, since most decks mean the slopes of ``PRESSURE-OVERCLOSURE`` as penalties; True takes these
+            laws as they stand, as ``SoftContact``.
+
+    Raises:
+        InputError, InputTypeError: for an argument of another type, or a keyword that cannot be read.
+        MissingFileError, MeshError, TagError: without the file, for a mesh that cannot be read, or a set without nodes of a body.
+    """
+    given.kind("path", path, isinstance(path, str | Path), "the path of an input file")
+    given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
+    given.flag("soft", soft)
+    file, kept = Path(path).expanduser().absolute(), dict[str, Any]()
+
+    def read() -> RawMesh:
+        if not file.is_file():
+            raise MissingFileError(f"input file {path} does not exist")
+        numbers = read_numbers(file)
+        kept["model"] = model_of(numbers)
+        raw = raw_of(found_of(numbers, file), file)
+        for surface, *_ in kept["model"].pretension:
+            raw = cut(raw, surface)
+        nodes = np.array(sorted(numbers.nodes), dtype=np.int64)
+        assert raw.of_file is not None
+        # nodes in the middle of cells that were made complete have no number
+        kept["numbers"] = np.where(raw.of_file < len(nodes), nodes[np.minimum(raw.of_file, len(nodes) - 1)], -1)
+        return raw
+
+    mesh, tags = distributed(comm, read, path)
+    deck = Deck(mesh, tags, comm.bcast(kept.get("model"), root=0), kept.get("numbers"), soft)
+    if deck.left_out and comm.rank == 0:
+        logger.warning("%s: without counterpart, or taken otherwise: %s", path, "; ".join(deck.left_out))
+    return deck
