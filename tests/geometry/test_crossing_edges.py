@@ -38,7 +38,7 @@ def warned(caplog, depth=0.05, *, cell="hexahedron", degree=1, shift=1.0 / N, sl
     sides = [s.tag(f"base {k}", k, at(2, z)) for k, z in ((0, -1.5), (1, 1.5))]
     bcs = [*clamp(V, sides[0], 0, 1, 2), *clamp(V, sides[1], 0, 1, 2, value=[0.0, 0.0, -depth * unit])]
     slopes = [s.tag(f"slopes {k}", k, lambda x, k=k: (1 - 2 * k) * x[:, 2] > -slope - 1e-9) for k in (0, 1)]
-    contact = uem.GeneralContact(max_penetration=unit) if contact is None else contact(*slopes)
+    contact = uem.GeneralContact(max_penetration=unit, edges=False) if contact is None else contact(*slopes)
     problem = uem.UnitedProblem(linear(u, 1e3), u, bcs=bcs, contacts=[contact])
     with caplog.at_level(logging.WARNING):
         for _ in uem.load_steps(problem, steps):
@@ -70,7 +70,7 @@ def test_declared_contacts(caplog, coupling):
     name = {"coupling": coupling, "name": "roofs"}
     for contact in (
         lambda low, high: uem.Contact(high, low, max_penetration=1.0, **name),
-        lambda low, high: uem.GeneralContact(max_penetration=1.0, **name),
+        lambda low, high: uem.GeneralContact(max_penetration=1.0, edges=False, **name),
     ):
         caplog.clear()
         told = warned(caplog, contact=contact)
@@ -78,7 +78,8 @@ def test_declared_contacts(caplog, coupling):
 
 
 def test_what_is_not_told(caplog):
-    """Edges that cross at their nodes, which hold them apart; parts that never touch; edges that are not sharp; ties."""
+    """Edges that are held apart, by equations of their own or at their nodes; parts that never touch; edges that are not sharp; ties."""
+    assert warned(caplog, contact=lambda low, high: uem.GeneralContact(max_penetration=1.0)) == []
     assert warned(caplog, shift=0.0) == []
     assert warned(caplog, contact=lambda low, high: uem.GeneralContact(exclude=[(low, high)])) == []
     assert warned(caplog, slope=0.15) == []

@@ -26,7 +26,7 @@ ROOMS = [
 #: Folders within contact/ from the ground up, and files of its own among them; ``""`` is all its other files.
 FLOORS = {
     "uem_dolfinx.contact": [
-        "laws", "seam", "nodes", "mortar", "friction", "ties", "thermal", "pair", "offsets", "heat_results", "results",
+        "laws", "seam", "nodes", "mortar", "edges", "friction", "ties", "thermal", "pair", "offsets", "heat_results", "results",
         "warnings", "", "general",
     ],
     "uem_dolfinx.solve": ["bodies", "rigid", "slots", "united", "", "steps"],
@@ -118,8 +118,8 @@ def test_imports_point_one_way():
 
 #: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
 BUDGETS = {
-    "members of the seam": 40, "members of Interface": 94, "heuristics": 14, "arrows within contact": 66, "arrows within solve": 39,
-    "lines of the package": 51889,
+    "members of the seam": 40, "members of Interface": 94, "heuristics": 14, "arrows within contact": 68, "arrows within solve": 39,
+    "lines of the package": 52879,
 }  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -19,6 +20,9 @@ from uem_dolfinx.geometry.sharp import SHARP_EDGE, pairs_of_equals, sharp_edges
 from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.edge_crossings import Crossings
 
 #: Bodies whose facets differ less in size are equally fine; the order of the mesh's input then determines which body follows.
 #: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
@@ -44,6 +48,9 @@ class Skin(TargetFacets):
         size: mean length of the sides of each body's facets, 0 for a body without facets ``(n_bodies,)``.
         extent: diagonal of each body's bounding box in the reference configuration ``(n_bodies,)``.
     """
+
+    #: Crossings of its sharp edges, if these are in contact.
+    crossings: Crossings | None = None
 
     def __init__(self, config: Configuration, tag: Tag):
         super().__init__(config, tag, "surface")

@@ -19,6 +19,7 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, COUPLINGS, MAX_PENETRATION, Contact
+from uem_dolfinx.contact.general.given_laws import given_edges, refuse_distant_pressures, refuse_open_conductance
 from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
@@ -30,7 +31,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, communicator_of
-from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.parallel import agreed
 
 if TYPE_CHECKING:
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
@@ -67,6 +68,9 @@ class GeneralContact(OfProblem, given.Sealed):
         normal: see ``Contact``; its pressure must be 0 from a gap of half a facet on. Only nearest facets press.
         heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
 
+        edges: whether sharp edges of different bodies that cross are held apart in 3D, by one equation at each crossing; None where
+            that goes: with ``"node_to_surface"``, without ``normal`` and ``heat``.
+
     Raises:
         InputError, InputTypeError: for an unknown word, or numbers out of their range.
     """
@@ -88,6 +92,7 @@ class GeneralContact(OfProblem, given.Sealed):
         name: str = "general contact",
         normal: SoftContact | None = None,
         heat: Conductance | Sequence[Conductance] | None = None,
+        edges: bool | None = None,
         tied: None = None,
     ):
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
@@ -111,6 +116,7 @@ class GeneralContact(OfProblem, given.Sealed):
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
             self.heats = conductances_of(heat)
             self.normal = given_normal(normal, friction, 0.0, self.heats, False)
+            self.edges = given_edges(edges, self.coupling, self.normal, self.heats)
             given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
             if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")
@@ -166,8 +172,8 @@ class GeneralContact(OfProblem, given.Sealed):
                 f"{self.name}: there is one body and no rigid surface: give rigid=..., or self_contact=True for a body that touches "
                 "itself"
             )
-        self._refuse_open_conductance(config, bound)
-        self._refuse_distant_pressures(config)
+        refuse_open_conductance(config, self.name, self.heats, bound)
+        refuse_distant_pressures(config, self.name, self.normal, skin)
         parts: list[Contact] = []
         if len(with_facets) > 1 or itself.any():
             apart: list[Apart] = [(*where(skin, one, "exclude"), *where(skin, other, "exclude")) for one, other in pairs]
@@ -189,31 +195,6 @@ class GeneralContact(OfProblem, given.Sealed):
         self._parts = parts
         return parts
 
-    def _refuse_open_conductance(self, config: Configuration, bound: float) -> None:
-        """Raise InputError for heat flow through gaps, since only facets within reach are searched (collective)."""
-        gaps, some = bound * np.array([1.0, 1e-2, 1e-4]), np.array([1.0, 1e2, 1e4])
-        for law in self.heats:
-            state = (np.zeros(3), gaps, some, 0.5 * some)[: 4 if law.of_temperatures else 2]
-            open_ = law.conductances(config.comm, self.name, state, np.zeros(3, bool))
-            if open_.any():
-                raise InputError(
-                    f"{self.name}: heat, h(0, g) is {open_.max():.6g} at gaps g: a general contact conducts where surfaces touch alone: "
-                    "expected 0 for g > 0, or a Contact between the two surfaces that conduct through their gap"
-                )
-
-    def _refuse_distant_pressures(self, config: Configuration) -> None:
-        """Raise InputError for pressures at gaps beyond the reach of the search, half a facet (collective)."""
-        if self.normal is not None:
-            from uem_dolfinx.geometry.neighbours import AHEAD_AT_REST
-
-            smallest = float(np.min(self._skin.size, where=self._skin.size > 0, initial=np.inf))
-            far = AHEAD_AT_REST * reduced(config.comm, smallest, op=MPI.MIN)
-            p = self.normal.pressures(config.comm, self.name, np.array([far]), far)[0]
-            if p[0] > 0.0:
-                raise InputError(
-                    f"{self.name}: normal, p is {p[0]:.6g} at a gap of half a facet, {far:.6g}: expected 0 from there on"
-                )
-
     def _nodes(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]
     ) -> list[Contact]:
@@ -229,7 +210,11 @@ class GeneralContact(OfProblem, given.Sealed):
         together: list[AmongContact] = []
         for k in range(n_lists):
             together.append(AmongContact(neighbours, k, together, name=self._name(k), normals=self.normals, **options))
-        return list(together)
+        if not self.edges or self._config.gdim < 3:
+            return list(together)
+        from uem_dolfinx.contact.general.edges import edge_contacts
+
+        return [*together, *edge_contacts(neighbours, bound, self.name, options)]
 
     def _mortar(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]

@@ -75,6 +75,10 @@ class BodiesContact(GeneralPart):
         """Numbers of the bodies opposite to contactors ``(n,)``, -1 for no body (collective)."""
         return np.asarray(skin.values_at(self.on_skin(self.pair.projection.facet), skin.body))
 
+    def acting_at(self) -> Array:
+        """Points of contactors' bodies where the contact forces act ``(n, gdim)``."""
+        return self.pair.points
+
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
         """Values by the body opposite to contactors ``(n,)``; None if they do not depend on it (collective)."""
         if self._by_pairs is None:

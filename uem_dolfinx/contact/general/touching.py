@@ -70,11 +70,11 @@ def sums_of_pairs(
         heat = sum((one.power() for one in pair.heats if one.law.field == field), np.zeros(len(active)))
         i = np.flatnonzero(active | pair.trial.force.any(axis=1) | (heat != 0))
         across = pair.pressing()[0]
-        second = np.full(len(i), skin.n_bodies + k)
+        second, x = np.full(len(i), skin.n_bodies + k), pair.points
         if isinstance(part, BodiesContact):
-            second = part.opposite(skin)[i]
+            second, x = part.opposite(skin)[i], part.acting_at()
         first, force = skin.body_of_node[pair.nodes[i]], config.of_circles(pair.trial.force[i])
-        turning = moments(config.of_circles(pair.points[i]) - centre, force)
+        turning = moments(config.of_circles(x[i]) - centre, force)
         rows = np.column_stack([active[i], across[i], heat[i], force, turning])
         keys, inverse = np.unique(first * n + second, return_inverse=True)
         sums = np.zeros((len(keys), rows.shape[1]))

@@ -43,6 +43,8 @@ class NodeToSurface(OnTarget):
     pointwise = at_feet = True
     #: Whether an end of the target holds contactors that first touch there, for all or for each ``(n,)``.
     ends_hold: bool | Bools = True
+    #: Contactors that something else holds, so that they must not touch the target ``(n,)``, or None.
+    left_out: Bools | None = None
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         self.concave_edges: ConcaveEdges | None = None
@@ -209,7 +211,7 @@ class NodalKinematics(PlacedOnTarget):
     @cached_property
     def ends(self) -> Ends:
         """Open ends, which can hold contactors; see ``Kinematics``."""
-        return Ends(self.projection, self.of.thickness, self.of.ends_hold)
+        return Ends(self.projection, self.of.thickness, self.of.ends_hold, out=self.of.left_out)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

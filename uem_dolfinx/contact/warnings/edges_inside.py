@@ -1,4 +1,4 @@
-"""Detection of sharp edges that cross between their nodes, where no nodal condition prevents penetration."""
+"""Detection of sharp edges that cross between their nodes, where no condition prevents penetration."""
 
 from __future__ import annotations
 
@@ -76,6 +76,8 @@ def warn(name: str, found: Crossing) -> None:
     """Warn of edges that cross."""
     place = ", ".join(f"{x:.6g}" for x in found.place)
     logger.warning(
-        "%s: sharp edges of two surfaces cross between their nodes, %.4g deep inside each other at (%s): contact acts at nodes of the "
-        "contactor only, so that nothing separates these edges; refine both edges there, or round them off", name, found.depth, place,
+        "%s: sharp edges of two surfaces cross between their nodes, %.4g deep inside each other at (%s), and no equation holds them apart: "
+        "a GeneralContact does so for edges of different bodies, without mortar, normal and heat; else refine both edges there, or round "
+        "them off",
+        name, found.depth, place,
     )  # fmt: skip

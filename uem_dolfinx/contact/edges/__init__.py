@@ -1,0 +1,1 @@
+"""Contact between sharp edges that cross: one equation for each crossing, with weights at the nodes of both edges."""
