@@ -46,8 +46,8 @@ __all__ = [
     "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "Slider", "SoftContact", "SpaceError",
     "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError",
     "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations",
-    "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet",
-    "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh", "figure", "form", "function_space",
+    "ViscousFriction", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass",
+    "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh", "figure", "form", "function_space",
     "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
     "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
     "read_deck", "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing",
@@ -131,6 +131,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.laws.thermal import OfTemperature
+    from uem_dolfinx.contact.laws.viscous import ViscousFriction
     from uem_dolfinx.contact.preload import Preload
     from uem_dolfinx.decks.deck import Deck, read_deck
     from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
@@ -180,7 +181,7 @@ _LATER = {
     "example_mesh": "geometry.gmsh", "read_gmsh": "geometry.gmsh",
     "assemble_matrix": "scripting", "assemble_vector": "scripting", "form": "scripting",
     "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
-    "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
+    "ViscousFriction": "contact.laws.viscous", "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation",
     "RigidCoupling": "conditions.rigid_coupling", "Ball": "conditions.joints", "Hinge": "conditions.joints",
     "Slider": "conditions.joints", "Spring": "conditions.joints",

@@ -131,6 +131,32 @@ def test_a_block_stops(coupling, cell, steps):
     assert errors[-1] <= 0.3 ** (len(errors) - 1) * errors[0]
 
 
+@pytest.mark.parametrize(("coupling", "cell"), [(c, "quadrilateral") for c in COUPLINGS] + [("node_to_surface", "hexahedron")])
+def test_a_block_on_a_film(coupling, cell):
+    """On a viscous film the speed of a block of mass 1 on area 1 falls as exp(-eta t), and the film dissipates its energy."""
+    errors = []
+    for dt in (0.1, 0.05):
+        block = Slider(uem.ViscousFriction(2.0), velocity=1.0, coupling=coupling, cell=cell)
+        (_, before, _, _), (_, way, speed, friction) = block.run(dt, 1.0)[-2:]
+        errors.append([speed - np.exp(-2.0), way - 0.5 * (1.0 - np.exp(-2.0))])
+        assert friction * block.N == pytest.approx(-2.0 * (way - before) / dt, rel=1e-3)
+        assert block.contact.dissipation == pytest.approx(0.5 * (1.0 - speed**2), rel=0.02)
+    assert (np.abs(errors[1]) <= 0.01).all() and (np.abs(errors[1]) <= 0.6 * np.abs(errors[0])).all()
+
+
+def test_a_film_with_a_limit():
+    """A traction of at most mu p: the block is slowed down evenly, and then by the film."""
+    fast = Slider(uem.ViscousFriction(2.0, mu=0.05), velocity=1.0)
+    t, _, speed, friction = fast.run(0.02, 1.6).T
+    limit = 0.05 * fast.N
+    # the film takes over at the speed limit / eta
+    even = speed > 0.6 * limit
+    assert even.sum() > 30 and friction[even] == pytest.approx(-0.05, rel=1e-6)
+    assert np.diff(speed[even])[6:] / np.diff(t[even])[6:] == pytest.approx(-limit, rel=5e-3)
+    after = t[even][-1] + (speed[even][-1] - 0.5 * limit) / limit
+    assert speed[-1] == pytest.approx(0.5 * limit * np.exp(-2.0 * (t[-1] - after)), rel=0.05)
+
+
 def test_the_tangent_is_consistent():
     """A step with friction that falls with the speed takes no more iterations than Newton's method does."""
     block = Slider(uem.Stribeck(0.5, 0.2, 0.3), velocity=0.2)
@@ -151,4 +177,7 @@ def test_statics_has_no_speed():
 
     raised(uem.InputError, "contact 'sole': Stribeck needs the speed of slip", lambda: problem(uem.Stribeck(0.3, 0.2, 0.1)))
     problem(uem.Stribeck(0.3, 0.2))
+    raised(uem.InputError, "contact 'sole': ViscousFriction needs the speed", lambda: problem(uem.ViscousFriction(1.0)))
+    raised(uem.InputError, "eta = -0.1", lambda: uem.ViscousFriction(-0.1))
+    raised(uem.InputError, "mu = 0", lambda: uem.ViscousFriction(1.0, mu=0.0))
     raised(uem.InputError, "kinetic = -0.1", lambda: uem.Stribeck(0.3, -0.1))

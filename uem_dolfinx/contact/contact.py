@@ -353,7 +353,7 @@ class Contact(WatchedContact, given.Sealed):
         of["max_penetration"] = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
-        tie, kind = self._tie(nodes, discretisation, means, **of), kind_of_interface(self)
+        tie, kind = self._tie(nodes, discretisation, means, **of), kind_of_interface(self, duration)
         self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
         if tie is not None and self.tied != "after":
             self._pair.project()

@@ -270,9 +270,10 @@ class ContactResults(HeatResults):
 
     @property
     def dissipation(self) -> float:
-        """Frictional dissipation in all committed steps: slip times the mean friction of each step (collective)."""
-        friction = self.pair.committed.friction
-        return float(reduced(self.config.comm, 0.0 if friction is None else float(friction.work.sum())))
+        """Energy dissipated in all committed steps: slip times the mean friction of each step, and by damping (collective)."""
+        friction, damping = self.pair.committed.friction, self.pair.committed.damping
+        own = 0.0 if friction is None else float(friction.work.sum())
+        return float(reduced(self.config.comm, own if damping is None else own + float(damping[:, 1].sum())))
 
     @property
     def wear(self) -> fem.Function:

@@ -32,6 +32,7 @@ def switch_off(pair: Interface) -> None:
     if f is not None:
         fresh = FrictionState.initial(n, g)
         state = replace(state, friction=replace(fresh, slipped=f.slipped, work=f.work, worn=f.worn))
+    state = replace(state, damping=pair.committed.damping)
     for name in ("bond", "heat"):
         if getattr(pair.committed, name) is not None:
             state = replace(state, **{name: np.zeros_like(getattr(pair.committed, name))})

@@ -36,7 +36,8 @@ class Energies:
         external: work of the external forces, of gravity and of the reactions of Dirichlet conditions.
         contact: work of the contact forces; zero except for friction, rounding, moving rigid targets, forces of preloads, the
             step of first contact, and soft contacts, which store it.
-        friction: energy dissipated by friction; with fixed targets its sum with ``contact`` is zero to rounding.
+        friction: energy dissipated by friction, and by damping of soft contacts; with fixed targets and hard contact its sum with
+            ``contact`` is zero to rounding.
         defect: change of the sum of energies minus the work of the external and contact forces.
     """
 

@@ -69,12 +69,16 @@ class SoftContact(given.Sealed):
             their pressures; or a function of gaps ``(n,)``, negative where surfaces overlap, that returns pressures ``(n,)``. Pressures
             are 0 or positive and do not increase with the gap.
         slope: derivative of a function p by the gap, ``(n,)``; None computes it from differences.
+        damping: pressure per speed at which surfaces in contact approach each other, in addition to p(g); the sum is never negative.
+            In time steps only.
 
     Raises:
-        InputError, InputTypeError: for a stiffness that is not positive, a table that is not monotone, or a slope without function.
+        InputError, InputTypeError: for a stiffness that is not positive, a table that is not monotone, a slope without function, or a
+            negative damping; when the problem is made, for a damping in statics.
     """
 
-    def __init__(self, p: OfGap, slope: Callable[[Array], npt.ArrayLike] | None = None):
+    def __init__(self, p: OfGap, slope: Callable[[Array], npt.ArrayLike] | None = None, *, damping: float = 0.0):
+        self.damping = given.number("damping", damping, given.NOT_NEGATIVE)
         if slope is not None:
             given.kind("slope", slope, callable(slope) and callable(p), "a function of gaps, for a function p", "leave it out")
         if hasattr(p, "pressure"):
@@ -90,7 +94,8 @@ class SoftContact(given.Sealed):
 
     def __repr__(self) -> str:
         """Its law, with its numbers."""
-        return f"SoftContact({'a function' if isinstance(self.law, _OfFunction) else self.law!r})"
+        damping = f", damping={self.damping!r}" if self.damping else ""
+        return f"SoftContact({'a function' if isinstance(self.law, _OfFunction) else self.law!r}{damping})"
 
     def pressures(self, comm: MPI.Comm, name: str, gap: Array, least: float) -> tuple[Array, Array]:
         """Pressures and their derivatives by the gap at gaps ``(n,)`` of a contact; gaps below ``least`` are rounding (collective).

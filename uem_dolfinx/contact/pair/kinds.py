@@ -15,11 +15,15 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.ties.tie import Tie
 
 
-def kind_of_interface(contact: Any) -> Callable[..., Interface]:
+def kind_of_interface(contact: Any, duration: Callable[[], float] | None) -> Callable[..., Interface]:
     """Class of a contact's interface: hard, soft, with cohesion, or with a fluid.
 
+    Args:
+        contact: as declared.
+        duration: length of the present step, a time; None in statics.
+
     Raises:
-        InputError: for a law of points, which have no areas.
+        InputError: for a law of points, which have no areas, and for damping in statics.
     """
     law = contact.normal or contact.cohesion or contact.leak
     if law is None:
@@ -30,7 +34,12 @@ def kind_of_interface(contact: Any) -> Callable[..., Interface]:
     if contact.normal is not None:
         from uem_dolfinx.contact.pair import soft
 
-        kind = soft.SoftInterface
+        if law.damping and duration is None:
+            raise InputError(
+                f"contact '{contact.name}': damping of {law!r} needs the speed of approach, and statics has none: give the problem "
+                "dynamics and take time steps, or leave damping out"
+            )
+        kind = partial(soft.SoftInterface, duration=duration)
     elif contact.leak is not None:
         from uem_dolfinx.contact.pair import leaking
 

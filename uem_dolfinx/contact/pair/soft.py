@@ -8,16 +8,25 @@ Within a step the forces are those that the linearised problem predicts, as the 
 gaps g_i* under them: the problem also closes what is left between g_i and g_i*. Any stiffness is then as good as hard contact, where
 forces by the gaps of every iterate would be too large. Rows contain both bodies: action equals reaction. For bodies that only
 contact holds, gaps with a stiffness are held.
+
+With damping c the pressure at the end of a time step dt that begins at the gap h is
+
+    P(g) = max(p(g) + c (min(h, r) - min(g, r)) / dt, 0)
+
+with the gap at rest r: the mean speed while the surfaces are in contact. P is a monotone and continuous law of the gap, so that damped
+contact is solved in the same way; it vanishes from the gap s <= r on, at which surfaces that separate come off.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
+import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
@@ -37,6 +46,8 @@ HELD_FROM = 1e-6
 #: Gaps under a pressure are found by so many bisections, and one step of Newton's method.
 #: [bound; bisections; -]
 BISECTIONS = 30
+#: Columns of the state of damping: gap, dissipated energy, and of its last step the gap at its beginning, damping over length, and time.
+GAP, WORK, BEGUN, RATE, AT = range(5)
 
 
 def stiffness_of_gaps(pair: Interface, stiffness: Array) -> tuple[Ints, Ints, Array]:
@@ -76,14 +87,17 @@ class SoftInterface(Interface):
     Args:
         law: pressure by the gap.
         contact: that it belongs to, for ``measured_areas`` and ``leads``, see ``ContactResults``.
+        duration: length of the present step, a time; None in statics.
     """
 
     #: Its forces store and release energy.
     works = True
 
-    def __init__(self, *args: Any, law: SoftContact, contact: Any, **how: Any):
+    def __init__(self, *args: Any, law: SoftContact, contact: Any, duration: Callable[[], float] | None = None, **how: Any):
         super().__init__(*args, **how)
-        self._law, self._contact = law, contact
+        self._law, self._contact, self._duration = law, contact, duration
+        #: Damping over the length of the step, gaps at its beginning, and gaps s from which on pressures vanish ``(n,)``, or None.
+        self._damped: tuple[Array, Array, Array] | None = None
         if getattr(self.discretisation, "concave_edges", None) is not None:
             self.discretisation.concave_edges = _Edges()  # type: ignore[attr-defined]
         n = len(self.nodes)
@@ -110,21 +124,62 @@ class SoftInterface(Interface):
         if not self._acts or known is None:
             self._multipliers, self._stiffness, self._holds = *np.zeros((2, n)), np.zeros(n, dtype=bool)
             return
-        rest, gap = self._law.law.rest, self.gaps()
+        gap = self.gaps()
+        rest = self._at_rest()
         at = np.where(np.isinf(known), gap, known)
         # where the law has no slope contactors are open; those that just touch have the stiffness of those that press
         opened = np.where(gap <= rest + TOUCHING * self.config.size, rest, gap)
-        self._at = np.where(self._pressures(at)[1] < 0.0, at, opened)
-        p, slope = self._pressures(np.append(self._at, rest))
+        self._at = np.where(self.pressures_at(at)[1] < 0.0, at, opened)
+        p, slope = self.pressures_at(self._at)
+        stiff = float(self._of_law(np.array([self._law.law.rest]))[1][0])
         self._area = np.where(self.off | ~self._contact.leads(), 0.0, self._contact.measured_areas())
-        self._multipliers, self._stiffness = self._area * p[:n] / self._force, -self._area * slope[:n] / self._force**2
-        self._holds = (self._area > 0.0) & (slope[:n] < 0.0) & (slope[:n] <= HELD_FROM * slope[-1])
-        self._stops = bool(slope[-1] < 0.0)
+        self._multipliers, self._stiffness = self._area * p / self._force, -self._area * slope / self._force**2
+        self._holds = (self._area > 0.0) & (slope < 0.0) & (slope <= HELD_FROM * stiff)
+        self._stops = stiff < 0.0
         super().set_forces(self._traction(self._multipliers))
 
-    def _pressures(self, gap: Array) -> tuple[Array, Array]:
-        """Pressures and their derivatives at gaps ``(n,)`` (collective)."""
+    def _of_law(self, gap: Array) -> tuple[Array, Array]:
+        """Pressures p and their derivatives at gaps ``(n,)`` (collective)."""
         return self._law.pressures(self.config.comm, self.name, gap, TOUCHING * self.config.size)
+
+    def pressures_at(self, gap: Array) -> tuple[Array, Array]:
+        """Pressures with damping and their derivatives at gaps ``(n,)`` (collective)."""
+        p, slope = self._of_law(gap)
+        if self._damped is None:
+            return p, slope
+        rate, _, rest = self._damped
+        p = p + rate * self._approached(gap)
+        presses = (gap <= rest) | (p > 0.0)
+        slope = slope - rate * (gap <= self._law.law.rest)
+        return np.where(presses, np.maximum(p, 0.0), 0.0), np.where(presses, slope, 0.0)
+
+    def _approached(self, gap: Array) -> Array:
+        """Approach of surfaces in contact from the beginning of the step to gaps ``(n,)``."""
+        assert self._damped is not None
+        rest = self._law.law.rest
+        return np.asarray(np.minimum(self._damped[1], rest) - np.minimum(gap, rest))
+
+    def _at_rest(self) -> Array:
+        """Gaps from which on pressures vanish, or at which the law rests ``(n,)`` (collective)."""
+        n, rest, state = len(self.nodes), self._law.law.rest, self.committed.damping
+        if state is None or self._duration is None:
+            return np.full(n, rest)
+        at, dt = float(self._contact._at), self._duration()
+        # a state that is committed keeps its pressures
+        here = state[:, AT] == at
+        rate = np.where(here, state[:, RATE], self._law.damping / dt if dt > 0.0 else 0.0)
+        begun = np.where(here, state[:, BEGUN], state[:, GAP])
+        low, high = np.minimum(begun, rest), np.full(n, rest)
+        self._damped = rate, begun, high
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            presses = self._of_law(middle)[0] + rate * self._approached(middle) > 0.0
+            low, high = np.where(presses, middle, low), np.where(presses, high, middle)
+        p, slope = self._of_law(middle)
+        slope, left = slope - rate, p + rate * self._approached(middle)
+        there = np.where((begun < rest) & (slope < 0.0), middle - left / np.where(slope < 0.0, slope, 1.0), rest)
+        self._damped = rate, begun, np.minimum(there, rest)
+        return self._damped[2]
 
     @property
     def _force(self) -> Array:
@@ -160,14 +215,14 @@ class SoftInterface(Interface):
         pressing, area = (self._stiffness > 0.0) & (multipliers > 0.0), np.where(self._area > 0.0, self._area, 1.0)
         p = np.where(pressing, multipliers * self._force / area, 0.0)
         # where the law is linearised from without a slope it begins at rest: forces grow with the solutions, not with the gaps
-        there = np.where(pressing, self._gaps_under(p, gap), np.maximum(gap, self._law.law.rest))
+        there = np.where(pressing, self._gaps_under(p, gap), np.maximum(gap, self._at_rest()))
         self.trial = replace(self.trial, law_gap=there)
 
     def _gaps_under(self, p: Array, gap: Array) -> Array:
         """Gaps under pressures ``(n,)``, from the present ones in the direction of predicted gaps (collective)."""
 
         def more(g: Array) -> Bools:
-            return self._pressures(g)[0] > p
+            return self.pressures_at(g)[0] > p
 
         begin, end = self._at, gap
         up, way = end > begin, end - begin
@@ -182,7 +237,7 @@ class SoftInterface(Interface):
             middle = 0.5 * (low + high)
             low, high = np.where(more(middle), middle, low), np.where(more(middle), high, middle)
         # Newton's rule for what bisection leaves
-        there, slope = self._pressures(middle)
+        there, slope = self.pressures_at(middle)
         return np.asarray(np.where(slope < 0.0, middle - (there - p) / np.where(slope < 0.0, slope, 1.0), middle))
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
@@ -225,7 +280,7 @@ class SoftInterface(Interface):
     def activate_touching(self) -> None:
         """None, but ends hold contactors that touch there, and pressures begin to act (collective)."""
         self.trial = self.committed = replace(
-            self.trial, at_end=self._at_end(self.trial), law_gap=np.full(len(self.nodes), np.inf)
+            self.trial, at_end=self._at_end(self.trial), law_gap=np.full(len(self.nodes), np.inf), damping=self._damping(False)
         )
         self.project()
 
@@ -262,10 +317,31 @@ class SoftInterface(Interface):
         """See ``Interface``; contactors that press have not passed an end, those that hold nothing follow their gaps."""
         known = self.trial.law_gap
         kept = None if known is None else np.where(self._holds, self._at, np.inf)
-        self.trial = replace(self.trial, passed=self.trial.passed & ~self.united, law_gap=kept)
+        self.trial = replace(self.trial, passed=self.trial.passed & ~self.united, law_gap=kept, damping=self._damping(True))
         super().commit()
+
+    def _damping(self, presses: bool) -> Array | None:
+        """The state of damping ``(n, 5)``, at the end of a step or, unless it ``presses``, at the start; None without (collective)."""
+        if not self._law.damping:
+            return None
+        gap, before = self.gaps(), self.committed.damping
+        state = np.column_stack([gap, np.zeros(len(gap)), gap, np.zeros(len(gap)), np.full(len(gap), float(self._contact._at))])
+        state[:, WORK] = 0.0 if before is None else before[:, WORK]
+        if presses and self._acts and self._damped is not None:
+            state[:, RATE], state[:, BEGUN], _ = self._damped
+            again = 0.0 if before is None else state[:, AT] == before[:, AT]
+            work = self._area * (self.pressures_at(gap)[0] - self._of_law(gap)[0]) * self._approached(gap)
+            state[:, WORK] += np.where(again, 0.0, work)
+        return state
 
     def restore(self) -> None:
         """See ``Interface``."""
         super().restore()
         self._predicted = None
+
+    def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
+        """See ``Interface``; pressures with damping are those of the state's own time (collective)."""
+        super().from_checkpoint(kept)
+        state = self.committed.damping
+        if state is not None and len(state):
+            self._contact._at = float(state[0, AT])

@@ -90,6 +90,8 @@ class PairState:
             and while it is switched off.
         cohesion: damage, delayed damage, load factor or time of these, permanent opening and normal of bonds ``(n, 3 + 2 gdim)``; None
             without cohesion.
+        damping: gap, dissipated energy, and of the last step the gap at its beginning, damping over length, and time ``(n, 5)``; None
+            without damping.
         wet: whether a fluid between the surfaces reaches the contactor ``(n,)``; None without fluid.
     """
 
@@ -110,6 +112,7 @@ class PairState:
     law_gap: Array | None = None
     cohesion: Array | None = None
     wet: Bools | None = None
+    damping: Array | None = None
 
     @property
     def has_law(self) -> bool:
@@ -145,7 +148,7 @@ class PairState:
             keys_of: function from facet numbers to keys independent of the partition ``(k,)``.
         """
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
-        for name in ("bond", "heat", "law_gap", "cohesion", "wet"):
+        for name in ("bond", "heat", "law_gap", "cohesion", "wet", "damping"):
             if getattr(self, name) is None:
                 del kept[name]
         if self.heat is not None and self.heat.shape[1] == 1:
