@@ -40,18 +40,18 @@ __all__ = [
     "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Deck", "Dynamics", "Elastic",
     "Energies", "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError",
     "FrictionError", "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "Leak",
-    "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeshError", "MissingBackendError", "MissingFileError",
-    "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError", "PenetrationError",
-    "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results", "ResultsWriter", "RigidCoupling",
-    "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "Slider", "SoftContact", "SpaceError",
-    "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError",
-    "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations",
-    "ViscousFriction", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass",
-    "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh", "figure", "form", "function_space",
-    "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark",
-    "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint",
-    "read_deck", "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing",
-    "timings", "write_checkpoint",
+    "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeanMotion", "MeshError", "MissingBackendError",
+    "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError",
+    "PenetrationError", "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results",
+    "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "Slider",
+    "SoftContact", "SpaceError", "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError",
+    "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
+    "UserFunctionError", "Vibrations", "ViscousFriction", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector",
+    "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh",
+    "figure", "form", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
+    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene",
+    "plot_setup", "read_checkpoint", "read_deck", "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent",
+    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -120,6 +120,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
     from uem_dolfinx.conditions.joints import Ball, Hinge, Slider, Spring
+    from uem_dolfinx.conditions.mean_motion import MeanMotion
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.laws.adhesion import Adhesion
     from uem_dolfinx.contact.laws.cohesive import Cohesive
@@ -183,6 +184,8 @@ _LATER = {
     "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
     "ViscousFriction": "contact.laws.viscous", "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation",
+    "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
+    "Equation": "conditions.equation", "periodic": "conditions.equation", "MeanMotion": "conditions.mean_motion",
     "RigidCoupling": "conditions.rigid_coupling", "Ball": "conditions.joints", "Hinge": "conditions.joints",
     "Slider": "conditions.joints", "Spring": "conditions.joints",
     "Preload": "contact.preload",

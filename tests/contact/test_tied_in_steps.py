@@ -27,6 +27,7 @@ from helpers import (
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
+from uem_dolfinx.parallel import reduced
 
 COMM = MPI.COMM_WORLD
 COUPLINGS = ("node_to_surface", "mortar")
@@ -37,6 +38,28 @@ def pulled(u, E, top):
     g, mesh = u.function_space.mesh.geometry.dim, u.function_space.mesh
     pull, v = fem.Constant(mesh, np.zeros(g)), ufl.TestFunction(u.function_space)
     return linear(u, E) - ufl.dot(pull, v) * forms.surface_measure(mesh, top.entities), pull
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_tied_across_a_gap(coupling):
+    """Blocks that do not touch are tied across their gap within the reach: the lower one hangs on the upper one, and the gap stays."""
+    b = blocks(COMM, "quadrilateral", 2, 4, gap=0.05)
+    contact = uem.Contact(b.high, b.low, coupling=coupling, tied="after")
+    F = uem.LinearElastic(1.0, 0.0, kind="plane_strain").residual(b.u, ufl.TestFunction(b.V)) * ufl.dx
+    rise = fem.Constant(b.scene.mesh, 0.0)
+    bcs = [uem.dirichlet(b.V, b.bottom), uem.dirichlet(b.V, b.top, 0), uem.dirichlet(b.V, b.top, 1, rise)]
+    problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[contact])
+    problem.solve()
+    with pytest.raises(uem.SurfaceError):
+        contact.tie(reach=0.04)
+    with pytest.raises(uem.InputError, match="reach"):
+        contact.tie(reach=-1.0)
+    contact.tie(reach=0.06)
+    for height in (0.1, -0.1):
+        rise.value = height
+        problem.solve()
+        assert contact.resultant().force[1] == pytest.approx(-height / 2.0, rel=1e-9)
+        assert contact.n_active == reduced(COMM, len(contact.nodes))
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)

@@ -222,3 +222,16 @@ def test_refused(folder):
     assert reduced(COMM, mesh.topology.index_map(2).size_local) == 1
     assert measure(mesh, uem.dx(tags["every"])) == pytest.approx(1.0) == measure(mesh, uem.ds(tags["side"]))
     assert "user" not in tags
+
+
+def test_single_nodes_as_tags(folder):
+    """Nodes by their numbers are tags of a point each; others than there are, and files without numbers, are refused."""
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    path = deck(folder, "one.inp", points, {"quad": [[0, 1, 2, 3]]})
+    mesh, tags = uem.read_mesh(path, COMM, nodes=(30,))
+    V = uem.function_space(mesh, 1, (2,))
+    x = V.tabulate_dof_coordinates()[uem.compat.bc_dofs(uem.dirichlet(V, tags["node 30"], 0))[0] // 2]
+    assert all(np.allclose(one[:2], (1.0, 1.0)) for one in x) and reduced(COMM, len(x)) >= 1
+    refused(uem.MeshError, "no node 7", lambda: uem.read_mesh(path, COMM, nodes=(7,)))
+    refused(uem.MeshError, "nodes = (1,)", lambda: uem.read_mesh(folder / "one.msh", COMM, nodes=(1,)))
+    refused(uem.InputTypeError, "nodes = 'a'", lambda: uem.read_mesh(path, COMM, nodes="a"))

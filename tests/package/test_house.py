@@ -120,6 +120,8 @@ def test_imports_point_one_way():
 BUDGETS = {
     "members of the seam": 40, "members of Interface": 94, "heuristics": 14, "arrows within contact": 68, "arrows within solve": 39,
     "lines of the package": 53027,
+    "members of the seam": 40, "members of Interface": 94, "heuristics": 14, "arrows within contact": 66, "arrows within solve": 39,
+    "lines of the package": 51983,
 }  # fmt: skip
 
 

@@ -424,18 +424,16 @@ class Contact(WatchedContact, given.Sealed):
         """Permanent tie or bonds, see ``tie_of``."""
         return tie_of(self, nodes, discretisation, means, **of)
 
-    def tie(self) -> None:
-        """Tie active contactors permanently at their present position, from the next step on; others remain in contact.
+    def tie(self, reach: float = 0.0) -> None:
+        """Tie contactors permanently at their present position, from the next step on; others remain in contact.
 
-        For contacts that were made with ``tied="after"``, between two steps (collective).
-
-        Raises:
-            InputError: for any other contact.
-            SurfaceError: if no contactor is active.
+        For contacts that were made with ``tied="after"``, between two steps: active contactors, and those across gaps up to ``reach``, a
+        length (collective). InputError for any other contact, SurfaceError if there are none.
         """
         if self.tied != "after":
             raise InputError(f"contact '{self.name}': tie() is for contacts that are made with tied='after'")
-        self.pair.unite(self.pair.committed.active)
+        near = self.pair.projection.gap <= given.number("reach", reach, given.NOT_NEGATIVE)
+        self.pair.unite(self.pair.committed.active | (near & ~self.pair.off & (reach > 0.0)))
         self.pair.project()
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:

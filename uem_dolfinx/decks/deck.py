@@ -44,16 +44,16 @@ from uem_dolfinx.solve.steps.step import Step as OfUsers
 #: Kinds of strains by the first letters of element types.
 STRAINS = {"C3D": "3d", "CPE": "plane_strain", "CPS": "plane_stress", "CAX": "axisymmetric"}
 #: Gaps up to this part of the model's size conduct heat: conductances of decks act before surfaces press.
-#: [convention; size of the model; test_deck_laws.py::test_gaps_that_conduct]
+#: [convention; size of the model; test_deck_runs.py::test_gaps_that_conduct]
 CONDUCTS = 1e-4
 #: Steps of time of heat grow by this factor, up to a tenth of the step's duration.
-#: [convention; length of the step of time before; test_deck_laws.py::test_heat_in_steps_of_time]
+#: [convention; length of the step of time before; test_deck_runs.py::test_heat_in_steps_of_time]
 LONGER = 1.5
 #: Steps that are longer by less than this part are equally long.
-#: [convention; length of the step; test_deck_laws.py::test_heat_in_steps_of_time]
+#: [bound; length of the step; -]
 SAME_LENGTH = 1e-6
 #: Number of steps of time of the greatest length.
-#: [convention; duration of the step; test_deck_laws.py::test_heat_in_steps_of_time]
+#: [convention; duration of the step; test_deck_runs.py::test_heat_in_steps_of_time]
 LEAST_STEPS = 10
 
 

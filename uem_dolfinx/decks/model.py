@@ -17,6 +17,7 @@ OUTPUT = (
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
 KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True}
 #: Number of the temperature among the degrees of freedom.
+#: [format; number; -]
 TEMPERATURE = 11
 
 #: A set or a node, by name, and a degree of freedom, or the label of a load.
@@ -260,10 +261,8 @@ class _Reader:
         """A set as it is, and a node as the set of its own."""
         if not where.isdigit():
             return where
-        name = f"node {int(where)}"
-        if int(where) in self._deck.nodes:
-            self._deck.nsets.setdefault(name.upper(), (name, [int(where)]))
-        return name
+        # reference nodes of sections belong to no body
+        return self._deck.name_node(int(where)) if int(where) in self._deck.nodes else f"node {int(where)}"
 
 
 def model_of(deck: Deck) -> Model:

@@ -7,7 +7,7 @@ elements are refused, and all others are kept as they stand, for ``uem_dolfinx.d
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -75,14 +75,19 @@ class Deck:
     cards: list[Card] = field(default_factory=list)
     loaded: set[str] = field(default_factory=set)
 
+    def name_node(self, number: int) -> str:
+        """Name of a set that has this node alone, which is made."""
+        name = f"node {number}"
+        self.nsets.setdefault(name.upper(), (name, [number]))
+        return name
 
-def read_found(path: Path) -> Found:
-    """Read the mesh of an input file.
 
-    Raises:
-        MeshError: if the file cannot be read.
-    """
-    return found_of(read_numbers(path), path)
+def read_found(path: Path, nodes: Sequence[int] = ()) -> Found:
+    """Read the mesh of an input file, with some ``nodes`` as sets of their own; MeshError if it cannot be read."""
+    deck = read_numbers(path)
+    for node in nodes:
+        deck.name_node(node)
+    return found_of(deck, path)
 
 
 def read_numbers(path: Path) -> Deck:

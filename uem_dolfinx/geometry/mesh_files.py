@@ -35,7 +35,13 @@ MESHIO_VERTICES = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
 
 
 def read_mesh(
-    path: str | Path, comm: MPI.Comm, gdim: int | None = None, *, cells: str | None = None, cut: str | Sequence[str] = ()
+    path: str | Path,
+    comm: MPI.Comm,
+    gdim: int | None = None,
+    *,
+    cells: str | None = None,
+    cut: str | Sequence[str] = (),
+    nodes: Sequence[int] = (),
 ) -> tuple[Any, Tags]:
     """Read a mesh file and its sets (collective).
 
@@ -55,6 +61,7 @@ def read_mesh(
         cells: ``"simplices"`` divides quadrilaterals into triangles, and hexahedra, prisms and pyramids into tetrahedra, of the same
             order, as meshes of several kinds of cells need; None leaves them.
         cut: names of plane surfaces inside bodies along which these are cut, see ``read_gmsh``.
+        nodes: numbers of nodes in an input file that become tags of a point each, ``"node 14"``.
 
     Returns:
         The mesh and its tags.
@@ -67,24 +74,28 @@ def read_mesh(
         MeshError: the file cannot be read, or it has no cells that this package can use.
     """
     given.kind("path", path, isinstance(path, (str, Path)), "the path of a mesh file")
+    listed = isinstance(nodes, Sequence) and all(isinstance(node, int) and node > 0 for node in nodes)
+    given.kind("nodes", nodes, listed, "numbers of nodes, as (14, 20)")
     if cells is not None:
         cells = given.word("cells", cells, ("simplices",))
     file = Path(path).expanduser().absolute()
     if file.suffix in (".geo", ".msh") and cells is None:
+        if len(nodes):
+            raise MeshError(f"nodes = {nodes!r} of {path}: expected an input file .inp, or physical points in Gmsh; leave it out")
         return read_gmsh(path, comm, gdim, cut=cut)
-    return distributed(comm, lambda: cut_along(_read(file, gdim, cells is not None), cut), path)
+    return distributed(comm, lambda: cut_along(_read(file, gdim, cells is not None, nodes), cut), path)
 
 
 # ---------------------------------------------------------------------------------------------- on rank 0
 
 
-def _read(path: Path, gdim: int | None, simplices: bool) -> RawMesh:
+def _read(path: Path, gdim: int | None, simplices: bool, nodes: Sequence[int]) -> RawMesh:
     """The whole mesh of a file."""
     if path.suffix == ".geo":
         raise MeshError(f"cells = 'simplices' is for meshes, and {path} is not meshed: leave it out, and recombine nothing")
     if not path.is_file():
         raise MissingFileError(f"mesh file {path} does not exist")
-    return raw_of(_found(path), path, gdim, simplices)
+    return raw_of(_found(path, nodes), path, gdim, simplices)
 
 
 def raw_of(found: Found, path: Path, gdim: int | None = None, simplices: bool = False) -> RawMesh:
@@ -131,12 +142,14 @@ def raw_of(found: Found, path: Path, gdim: int | None = None, simplices: bool = 
     return replace(raw, of_file=nodes)
 
 
-def _found(path: Path) -> Found:
-    """Content of the file."""
+def _found(path: Path, nodes: Sequence[int]) -> Found:
+    """Content of the file, with ``nodes`` as sets of their own."""
     if path.suffix.lower() == ".inp":
         from uem_dolfinx.geometry.decks import read_found
 
-        return read_found(path)
+        return read_found(path, nodes)
+    if len(nodes):
+        raise MeshError(f"nodes = {nodes!r}: only input files .inp of Abaqus and CalculiX number their nodes; leave it out")
     try:
         import meshio
     except ImportError as error:
