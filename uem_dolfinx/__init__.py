@@ -183,8 +183,6 @@ _LATER = {
     "assemble_matrix": "scripting", "assemble_vector": "scripting", "form": "scripting",
     "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
     "ViscousFriction": "contact.laws.viscous", "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
-    "Equation": "conditions.equation", "periodic": "conditions.equation",
-    "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
     "Equation": "conditions.equation", "periodic": "conditions.equation", "MeanMotion": "conditions.mean_motion",
     "RigidCoupling": "conditions.rigid_coupling", "Ball": "conditions.joints", "Hinge": "conditions.joints",
     "Slider": "conditions.joints", "Spring": "conditions.joints",
