@@ -227,6 +227,27 @@ def test_a_slider(cell):
     assert np.allclose(np.ravel(slider.moment), -np.cross(arm, full)[-r.k :], atol=1e-11)
 
 
+@pytest.mark.parametrize("cell", ["quadrilateral", slow("hexahedron")])
+def test_a_crank(cell):
+    """A crank of 1 and a rod of 3 drive a piston against a force, all the way round: its place, and the torque by virtual work."""
+    r = Row(cell, n=3)
+    z, led = ([] if r.g == 2 else [(0.0, 0.0, 1.0)]), [None] * (r.g + r.k - 1)
+    o, pin, end = r.at(0.0, 0.0), r.at(1.0, 0.0), r.at(4.0, 0.0)
+    crank = uem.RigidCoupling(r.tags[0], o, motion=[*led, lambda factor: 2.0 * np.pi * factor])
+    rod, piston = r.part(1), uem.RigidCoupling(r.tags[2], end, force=r.vector(0.5, 0.0))
+    joints = [uem.Hinge(None, crank, o, *z), uem.Hinge(crank, rod, pin, *z), uem.Hinge(rod, piston, end, *z)]
+    slider = uem.Slider(None, piston, end, r.vector(1.0, 0.0))
+    for step in uem.load_steps(r.problem(crank, rod, piston, *joints, slider), 8):
+        t = 2.0 * np.pi * step.factor
+        reach = np.sqrt(9.0 - np.sin(t) ** 2)
+        assert slider.displacement == pytest.approx(np.cos(t) + reach - 4.0, abs=1e-12)
+        torque = 0.5 * np.sin(t) * (1.0 + np.cos(t) / reach)
+        assert np.ravel(crank.reaction[1])[-1] == pytest.approx(torque, abs=1e-9)
+        # near a full turn rounding turns the axis of the rotation vector in space
+        assert joints[0].angle == pytest.approx(t, abs=1e-11 if r.g == 2 else 1e-7)
+        assert joints[2].force[:1] == pytest.approx([-0.5], abs=1e-9)
+
+
 def test_a_slider_that_turns():
     """A piston that may turn follows a moment about its axis alone; the rest is the cylinder's."""
     r = Row("hexahedron")
@@ -327,6 +348,28 @@ def test_a_chain_on_the_floor():
     assert hinges[0].force == pytest.approx([0.0, 0.1 + carried - push[0]], abs=1e-10)
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_dragging_arm(way):
+    """Under an arm on a hinge the floor is drawn along: friction presses its tip down or lifts it, as the moments about the hinge say."""
+    r = Row()
+    arm = r.part(1, force=(0.0, -0.1))
+    hinge = uem.Hinge(None, arm, r.at(2.25, 0.7))
+    floor = uem.RigidPlane((0.0, -0.1), (0.0, 1.0))
+    end = r.scene.tag("end", 1, lambda x: np.isclose(x[:, 0], 4.5))
+    contact = uem.Contact(contactor=end, target=floor, friction=0.3)
+    problem = r.problem(r.held(), arm, hinge, contacts=[contact])
+    problem.solve()
+    for _ in range(3):
+        floor.move((0.1 * way, 0.0))
+        problem.solve()
+    R = rotation_matrix(np.array([arm.rotation]))
+    lever, tip = (R @ (np.array(X) - r.at(2.25, 0.7)) for X in (r.at(3.5), (4.5, 0.0)))
+    push, rub = contact.resultant().force[[1, 0]]
+    assert rub == pytest.approx(0.3 * way * push, rel=1e-9)
+    assert push == pytest.approx(0.1 * lever[0] / (tip[0] - 0.3 * way * tip[1]), rel=1e-9)
+    assert hinge.force == pytest.approx([-rub, 0.1 - push], abs=1e-10)
+
+
 # -- what is refused -------------------------------------------------------------------------------------------------------
 
 
@@ -359,6 +402,22 @@ def test_what_is_refused():
     r.problem(a, b, ball)
     refused(uem.SpaceError, ("RigidCoupling", "another problem"), lambda: r.problem(a, b, ball))
     refused(uem.InputTypeError, ("couplings[1]",), lambda: r.problem(r.part(0), 3.0))
+
+
+def test_steps_and_gradients_that_have_none():
+    """Explicit steps and gradients name couplings."""
+    r = Row()
+    parts = r.held(), r.part(1)
+    ball, mass = uem.Ball(*parts, r.at(2.25)), uem.lumped_mass(r.V, 1.0)
+    explicit = uem.Dynamics(mass, scheme=uem.CentralDifferences())
+    refused(uem.InputError, "couplings does not go with CentralDifferences", lambda: r.problem(*parts, ball, dynamics=explicit))
+    parts = r.held(), r.part(1)
+    f = fem.Constant(r.scene.mesh, 1.0)
+    problem = uem.UnitedProblem(
+        f * st_venant(r.u, 1.0), r.u, couplings=[*parts, uem.Slider(*parts, r.at(2.25), (1.0, 0.0), stiffness=1.0)]
+    )
+    problem.solve()
+    refused(uem.InputError, "joints", lambda: uem.gradient(problem, r.u[0] * uem.ds(r.tags[1]), [f]))
 
 
 def test_joints_that_contradict_conditions():

@@ -123,6 +123,26 @@ def test_a_double_pendulum():
     assert np.allclose(*ends, atol=1e-12)
 
 
+@pytest.mark.slow
+def test_a_ball_in_space():
+    """A bar swings about a ball in space: energy is kept to second order in the step, and the ball carries no moment."""
+    errors = []
+    for n in (50, 100):
+        r = Row("hexahedron")
+        bar = r.part(0)
+        ball = uem.Ball(None, bar, o := r.at(-0.5))
+        v = fem.Function(r.V)
+        v.interpolate(lambda x: turned(np.array([0.3, 1.5, 0.0]), x.T - o).T)
+        problem, dynamics = r.problem(bar, ball, velocity=v)
+        first, energy = dynamics.kinetic_energy(), []
+        for _ in uem.time_steps(problem, 1.0 / n, 1.0):
+            energy.append(dynamics.kinetic_energy() + r.m * G * bar.displacement[1])
+            assert np.linalg.norm(r.at(1.0) + bar.displacement - o) == pytest.approx(1.5, rel=1e-12)
+        errors.append(np.abs(np.array(energy) / first - 1.0).max())
+    assert errors[1] <= 2e-3 and errors[1] <= 0.3 * errors[0]
+    assert not ball.moment.any() and abs(bar.displacement[2]) > 0.01
+
+
 @pytest.mark.parametrize("law", [linear, st_venant])
 def test_a_mass_on_a_spring(law):
     """A slider with a spring, and a spring in its line, swing with the frequency of their stiffness; energy is conserved."""
