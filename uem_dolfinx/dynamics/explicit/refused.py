@@ -29,8 +29,13 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
     if not is_explicit(dynamics):
         return
     remedy = "leave it out, or take an implicit scheme, as uem.newmark()"
+    massy = dynamics.contactors == "massy"
     for name, value in others.items():
-        if value:
+        if value and name == "equations" and not massy:
+            raise InputError(
+                "equations need nodes with mass to go with CentralDifferences: take Dynamics(..., contactors='massy')"
+            )
+        if value and name != "equations":
             raise InputError(f"{name} does not go with CentralDifferences: {remedy}")
     if not dynamics.mass.diagonal:
         raise InputError(
@@ -38,13 +43,15 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
         )
     for contact in contacts:
         name = f"contact '{contact.name}'"
-        if isinstance(contact, GeneralContact) and dynamics.contactors == "massless":
+        if isinstance(contact, GeneralContact) and not massy:
             raise InputError(
                 f"{name}: GeneralContact, whose surfaces may keep mass, does not go with CentralDifferences and massless contactors: "
                 "take Dynamics(..., contactors='massy'), or name each contact"
             )
-        if getattr(contact, "tied", False):
-            raise InputError(f"{name} is tied, and its nodes have mass, which CentralDifferences move freely: {remedy}")
+        if getattr(contact, "tied", False) and not massy:
+            raise InputError(
+                f"{name} is tied, and needs nodes with mass to go with CentralDifferences: take Dynamics(..., contactors='massy')"
+            )
         if getattr(contact, "heats", ()):
             raise InputError(f"{name} conducts heat, which does not go with CentralDifferences: {remedy}")
         for what in ("normal", "cohesion", "leak"):

@@ -1,4 +1,4 @@
-"""Explicit steps for contactors that keep their mass: nodes move freely, then contact corrects them by a united system of masses.
+"""Explicit steps for contactors that keep their mass: nodes move freely, then contact, ties and equations correct them by a united system.
 
 Bodies move by central differences to ``u*``. With the masses M in place of the stiffness, the united system
 
@@ -96,7 +96,7 @@ class StepperWithMass(ExplicitStepper):
             )
         self.bodies = InertBodies(problem.bodies, self._mass)
         solver = solver_of(problem.config, "uem_masses_", OPTIONS)
-        self.system = BodySystem(self.bodies, problem.interfaces, solver, consistent_tangent=False)
+        self.system = BodySystem(self.bodies, problem.interfaces, solver, consistent_tangent=False, linear=problem.linear)
 
     def begin(self) -> None:
         """Find the first accelerations (collective)."""
@@ -128,13 +128,13 @@ class StepperWithMass(ExplicitStepper):
         a = self._accelerations()
         half, kick = (problem.u.x.array[:n] - begin) / dt, 0.5 * dt * a
         # contact takes part in the change of the velocity, and the next step starts with the velocity in its middle all the same
-        taken = self._along_contact(kick) if history[-1].active else kick
+        taken = self._along_contact(kick) if history[-1].active or problem.linear is not None else kick
         problem.commit()
         dynamics.change_rates(np.where(self.moving, half + taken, dynamics.velocity.x.array[:n]), a + (kick - taken) * 2.0 / dt)
         return history
 
     def _along_contact(self, change: Array) -> Array:
-        """Change of velocities ``(n,)`` by a kick and the impulses of contact, which keep gaps closed (collective)."""
+        """Change of velocities ``(n,)`` by a kick and the impulses of contact and equations (collective)."""
         M, rows, solver = self.bodies.tangent.K, self.system.rows, self.system.solver
         assert rows is not None
         P, Q = rows.frictionless, rows.test
@@ -147,6 +147,9 @@ class StepperWithMass(ExplicitStepper):
         problem = self.problem
         for pair in problem.interfaces:
             check_moved(pair)
+        if problem.linear is not None:
+            n, g = problem.config.n_owned, problem.config.gdim
+            problem.linear.begin_step(problem.committed[: n * g].reshape(n, g), 1.0)
         self.system.begin_step()
         history = solve_united(
             self.bodies,
