@@ -39,7 +39,9 @@ L, d = 24.0, 0.1
 # %%
 
 
-def pressed(cells: tuple[int, int], on_edge: bool, angle: float = 90.0) -> tuple[uem.UnitedProblem, uem.GeneralContact, uem.LoadStep]:
+def pressed(
+    cells: tuple[int, int], on_edge: bool, angle: float = 90.0
+) -> tuple[uem.UnitedProblem, uem.GeneralContact, uem.LoadStep]:
     """Two rods with these cells along them, in equilibrium."""
     sizes = {"length": L, "n_1": cells[0], "n_2": cells[1], "m": args.m, "on_edge": int(on_edge), "angle": np.radians(angle)}
     mesh, tags = uem.read_gmsh(common.MESHES / "crossed_rods.geo", comm, gdim=3, parameters=sizes)

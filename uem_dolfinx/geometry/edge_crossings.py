@@ -16,7 +16,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.candidates import balls_that_meet
-from uem_dolfinx.geometry.edge_gaps import EdgeGaps, cubics
+from uem_dolfinx.geometry.edge_gaps import EdgeGaps, cubics, may_cross
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.sharp import SHARP_EDGE, pairs_of_equals, sharp_edges
@@ -36,7 +36,8 @@ SECTOR = 0.1
 #: both nodes of each piece are held by it alone.
 #: [convention; length of a unit normal; test_edge_crossings.py::test_nodes_at_ridges]
 RIDGES = 0.2
-#: Edges that were deeper inside each other at the end of the last step are on other sides of their bodies.
+#: Edges that were deeper inside each other at the end of the last step are on other sides of their bodies; crossings nearer to the end of
+#: a line are left to its last node.
 #: [convention; length of an edge between nodes; test_edge_crossings.py::test_edges_behind_each_other]
 EDGES_BEHIND = 1e-3
 #: The first node of an edge has the equation of crossings up to here, beyond the middle, since many lie there.
@@ -298,11 +299,13 @@ class Crossings:
         """All crossings of owned nodes (collective)."""
         config, one, other = self._config, self.first, self.second
         comm, now = config.comm, self._x
-        x, before, y, behind = (lines.places(at) for lines in (one, other) for at in (now, self._committed))
+        x, before, normals = one.places(now), one.places(self._committed), one.normals()
+        y, behind, m = x, before, normals
+        if other is not one:
+            y, behind, m = other.places(now), other.places(self._committed), other.normals()
         (c, r), (d, q) = _balls(x), _balls(y)
         box = np.stack([(d - q[:, None]).min(axis=0, initial=np.inf), (d + q[:, None]).max(axis=0, initial=-np.inf)])
         rows = [np.flatnonzero(((c - r[:, None] <= b[1]) & (c + r[:, None] >= b[0])).all(axis=1)) for b in gathered(comm, box)]
-        m, normals = other.normals(), one.normals()
         x, before, cubic, normals, nodes, key, told, ends = Exchange(comm, rows).send(
             x, before, one.cubics, normals, one.nodes, one.keys, self._keys[0], one.ends
         )
@@ -310,24 +313,24 @@ class Crossings:
         if len(x) and len(y):
             i, j = balls_that_meet(*_balls(x), d, q)
             apart = (nodes[i][:, 1:3, None] != other.nodes[j][:, None, 1:3]).all(axis=(1, 2))
-            some = apart & self._meet(told[i], self._keys[1][j])
+            some = np.flatnonzero(apart & self._meet(told[i], self._keys[1][j]))
             i, j = i[some], j[some]
+            near = may_cross(x[i], y[j], EDGES_PARALLEL)
+            i, j = i[near], j[near]
         gaps = EdgeGaps.between((cubic[i], other.cubics[j]), x[i], y[j], m[j].sum(axis=1))
-        # lines that slide along each other turn, and their crossing moves
-        then = EdgeGaps.between(gaps.cubics, before[i], behind[j], gaps.normal)
-        committed = np.maximum(then.gap, replace(gaps, x=before[i], y=behind[j]).gap)
         ends = np.concatenate([ends[i], other.ends[j]], axis=1)
         within = np.minimum(_within(-gaps.normal, normals[i]), _within(gaps.normal, m[j]))
-        fits = np.flatnonzero(self._opposite(gaps, committed, within, ends))
-        i, j, gaps, facets = i[fits], j[fits], gaps.take(fits), other.facets
-        f, second, ridges = other.facet[j], gaps.s > FIRST_NODE, within[fits] > RIDGES
+        fits = np.flatnonzero(self._opposite(gaps, within, ends))
+        fits = fits[self._in_front(gaps.take(fits), before[i[fits]], behind[j[fits]])]
+        i, j, gaps, within, ends, facets = i[fits], j[fits], gaps.take(fits), within[fits], ends[fits], other.facets
+        f, second, ridges = other.facet[j], gaps.s > FIRST_NODE, within > RIDGES
         told, keys = np.concatenate([told[i], self._keys[1][j]], axis=1), np.column_stack([key[i], other.keys[j]])
         both = []
         for leads, own in ((True, np.where(second, 2, 1)), (False, np.where(second, 1, 2))):
             both.append(
                 Opposite(
                     nodes[i, own], own, np.full(len(i), leads), ridges, gaps.s, gaps.t, gaps.x, gaps.y, *gaps.cubics,
-                    gaps.normal, nodes[i], other.nodes[j], ends[fits], f + facets.first[comm.rank], other.on_facet(j, gaps.t),
+                    gaps.normal, nodes[i], other.nodes[j], ends, f + facets.first[comm.rank], other.on_facet(j, gaps.t),
                     facets.nodes[f], facets.x[f], keys, told,
                 )
             )  # fmt: skip
@@ -335,12 +338,19 @@ class Crossings:
         found = found.take(found.leads | (found.gaps.weights[0][np.arange(len(found.own)), found.own] >= AT_NODE))
         return Opposite._make(Exchange.to(comm, config.owner_of(found.node)).send(*found))
 
-    def _opposite(self, gaps: EdgeGaps, committed: Array, within: Array, ends: Bools) -> Bools:
+    def _in_front(self, gaps: EdgeGaps, before: Array, behind: Array) -> Bools:
+        """Which pieces were not inside each other at the end of the last accepted step, with nodes there at these places ``(k, 4, 3)``."""
+        # lines that slide along each other turn, and their crossing moves
+        then = EdgeGaps.between(gaps.cubics, before, behind, gaps.normal)
+        committed = np.maximum(then.gap, replace(gaps, x=before, y=behind).gap)
+        shorter = np.minimum(_lengths(gaps.x), _lengths(gaps.y))
+        return np.asarray(committed >= -np.maximum(EDGES_BEHIND * shorter, self._overlap))
+
+    def _opposite(self, gaps: EdgeGaps, within: Array, ends: Bools) -> Bools:
         """Which pairs of pieces are opposite to each other ``(k,)``.
 
         Args:
             gaps: between the pieces.
-            committed: gaps between them at the end of the last accepted step ``(k,)``.
             within: see ``_within`` ``(k,)``.
             ends: as in ``Opposite``.
         """
@@ -351,13 +361,13 @@ class Crossings:
         for k, (xi, length) in enumerate(zip((gaps.s, gaps.t), lengths)):
             first, last = ends[:, 2 * k], ends[:, 2 * k + 1]
             at_corners &= (first & (xi < AT_NODE)) | (last & (xi > 1.0 - AT_NODE))
-            inside &= (xi >= np.where(first, 0.0, -PAST_END)) & (xi <= np.where(last, 1.0, 1.0 + PAST_END))
+            least, most = np.where(first, EDGES_BEHIND, -PAST_END), np.where(last, 1.0 - EDGES_BEHIND, 1.0 + PAST_END)
+            inside &= (xi >= least) & (xi <= most)
             # bodies that overlap by less past the end of a line part there
             left = np.minimum(np.where(first, xi, np.inf), np.where(last, 1.0 - xi, np.inf)) * length
             inside &= (g >= 0.0) | (-g <= left)
         # two corners on each other are held as nodes
-        inside &= (within >= -SECTOR) & ~at_corners
-        return np.asarray(inside & (committed >= -np.maximum(EDGES_BEHIND * shorter, self._overlap)))
+        return np.asarray(inside & (within >= -SECTOR) & ~at_corners)
 
 
 def _lengths(x: Array) -> Array:

@@ -13,11 +13,14 @@ from functools import cached_property
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Ints, cross_products
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 
 #: Newton's iterations for the closest points of two lines.
 #: [bound; iterations; -]
 LINE_ITERATIONS = 12
+#: They end with steps below this one.
+#: [bound; reference coordinates; -]
+LINE_ROUNDING = 1e-15
 #: Steps of these iterations are shorter.
 #: [bound; reference coordinates; -]
 LONGEST_STEP = 1.0
@@ -75,12 +78,28 @@ def closest_points(cubics: tuple[Array, Array], x: Array, y: Array) -> tuple[Arr
     p, q = x[:, 1], y[:, 1]
     a, b = x[:, 2] - p, y[:, 2] - q
     s, t = _step(p - q, a, b, 0.0 * a, 0.0 * b)
+    todo = np.arange(len(s))
     for _ in range(LINE_ITERATIONS):
-        s, t = (np.clip(xi, -LONGEST_STEP, 1.0 + LONGEST_STEP) for xi in (s, t))
-        (p, a, da), (q, b, db) = _points(cubics[0], s, x), _points(cubics[1], t, y)
-        more = _step(p - q, a, b, da, db)
-        s, t = (xi + np.clip(way, -LONGEST_STEP, LONGEST_STEP) for xi, way in zip((s, t), more))
+        now = [np.clip(xi[todo], -LONGEST_STEP, 1.0 + LONGEST_STEP) for xi in (s, t)]
+        (p, a, da), (q, b, db) = (_points(of[todo], xi, z[todo]) for of, xi, z in zip(cubics, now, (x, y)))
+        more = np.clip(_step(p - q, a, b, da, db), -LONGEST_STEP, LONGEST_STEP)
+        s[todo], t[todo] = now + more
+        todo = todo[np.abs(more).max(axis=0, initial=0.0) > LINE_ROUNDING]
+        if not len(todo):
+            break
     return s, t
+
+
+def may_cross(x: Array, y: Array, sine: float) -> Bools:
+    """Whether lines through ``x`` and ``y (k, 4, 3)``, which bend little, may cross with this sine of their angle at least ``(k,)``."""
+    p, q = x[:, 1], y[:, 1]
+    a, b = x[:, 2] - p, y[:, 2] - q
+    across = _dot(a, a) * _dot(b, b)
+    steep = np.flatnonzero(across - _dot(a, b) ** 2 > (0.5 * sine) ** 2 * across)
+    p, q, a, b = (part[steep] for part in (p, q, a, b))
+    found = np.zeros(len(x), bool)
+    found[steep] = (np.abs(np.stack(_step(p - q, a, b, 0.0 * a, 0.0 * b)) - 0.5) <= 0.5 + LONGEST_STEP).all(axis=0)
+    return found
 
 
 def _step(away: Array, a: Array, b: Array, da: Array, db: Array) -> tuple[Array, Array]:

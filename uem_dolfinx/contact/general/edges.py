@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from mpi4py import MPI
+
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
@@ -13,6 +15,7 @@ from uem_dolfinx.contact.general.parts import BodiesContact
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.edge_crossings import Crossings, SharpLines
 from uem_dolfinx.geometry.projection import Target
+from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.geometry.neighbours import Neighbours
@@ -63,11 +66,13 @@ def crossings_of(neighbours: Neighbours, overlap: float) -> Crossings:
 
 
 def edge_contacts(neighbours: Neighbours, overlap: float, name: str, options: dict[str, Any]) -> Sequence[EdgeContact]:
-    """Contacts at crossings of edges, one for each crossing that a node may have (collective); none without sharp edges."""
+    """Contacts at crossings of edges, one for each crossing that a node may have (collective); none unless two bodies have sharp edges."""
     crossings = crossings_of(neighbours, overlap)
-    if not crossings.first.total:
+    lines, skin = crossings.first, neighbours.skin
+    with_edges = np.bincount(skin.body[lines.facet], minlength=skin.n_bodies) > 0
+    if reduced(skin.config.comm, with_edges, op=MPI.LOR).sum() < 2:
         return []
-    neighbours.skin.crossings = crossings
+    skin.crossings = crossings
     return [
         EdgeContact(neighbours, crossings, k, name=f"{name} at edges" + f" {k + 1}" * (k > 0), **options) for k in range(LISTS)
     ]

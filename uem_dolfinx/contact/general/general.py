@@ -24,7 +24,7 @@ from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, Rigid
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
-from uem_dolfinx.contact.laws.law import Field, FrictionLaw, given_friction, given_normal
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, given_normal
 from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -69,7 +69,7 @@ class GeneralContact(OfProblem, given.Sealed):
         heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
 
         edges: whether sharp edges of different bodies that cross are held apart in 3D, by one equation at each crossing; None where
-            that goes: with ``"node_to_surface"``, without ``normal`` and ``heat``.
+            that goes: with ``"node_to_surface"``, without ``normal``, ``heat`` and laws of friction by area.
 
     Raises:
         InputError, InputTypeError: for an unknown word, or numbers out of their range.
@@ -116,7 +116,8 @@ class GeneralContact(OfProblem, given.Sealed):
             given.kind("name", name, isinstance(name, str) and bool(name), "a text")
             self.heats = conductances_of(heat)
             self.normal = given_normal(normal, friction, 0.0, self.heats, False)
-            self.edges = given_edges(edges, self.coupling, self.normal, self.heats)
+            law = as_law(friction if self._pairs is None else self._pairs.law)
+            self.edges = given_edges(edges, self.coupling, self.normal, self.heats, law)
             given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
             if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.contact.laws.conductance import Conductance
+from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.skin import Skin
@@ -20,13 +21,16 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.laws.soft import SoftContact
 
 
-def given_edges(edges: bool | None, coupling: str, normal: SoftContact | None, heats: Sequence[Conductance]) -> bool:
+def given_edges(
+    edges: bool | None, coupling: str, normal: SoftContact | None, heats: Sequence[Conductance], law: FrictionLaw
+) -> bool:
     """Whether edges that cross are held apart.
 
     Raises:
         InputError, InputTypeError: if that does not go with the other arguments, or for another value.
     """
-    others = {"coupling": coupling if coupling != "node_to_surface" else None, "normal": normal, "heat": heats or None}
+    others: dict[str, Any] = {"coupling": coupling if coupling != "node_to_surface" else None, "normal": normal}
+    others |= {"heat": heats or None, "friction": law if law.per_area else None}
     wrong = {word: value for word, value in others.items() if value is not None}
     if edges is None:
         return not wrong
