@@ -83,7 +83,8 @@ def arguments(docstring: str | None, **options: Any) -> argparse.Namespace:
         text = f"{words.get(name, '')} (default: {shown})".strip()
         parser.add_argument("--" + name.replace("_", "-"), default=default, help=text.replace("%", "%%"), **kind)
     logging.basicConfig(format="%(message)s")
-    args = parser.parse_args()
+    # in a notebook the command line is that of the kernel
+    args = parser.parse_args([] if "ipykernel" in sys.modules else None)
     if args.setup:
         draw_setup(args.setup, **of_sketch(Path(sys.argv[0]).stem))
     return args

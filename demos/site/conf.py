@@ -5,8 +5,10 @@
 
 import sys
 import tomllib
+from html import escape
 from pathlib import Path
 
+from docutils import nodes
 
 sys.path.insert(0, str(Path(__file__).parent))
 import reading
@@ -16,7 +18,8 @@ from sphinx.util.inspect import TypeAliasForwardRef
 project = "uem_dolfinx"
 author = "uem_dolfinx contributors"
 copyright = f"2025-2026, {author}"
-version = release = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]["version"]
+about = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+version = release = about["version"]
 
 extensions = [
     "myst_nb",
@@ -54,6 +57,7 @@ html_title = "uem_dolfinx"
 pygments_dark_style = "github-dark"
 html_static_path = ["site.css"]
 html_css_files = ["site.css"]
+html_favicon = "favicon.svg"
 html_copy_source = False
 html_show_sphinx = False
 
@@ -69,9 +73,11 @@ TypeAliasForwardRef.__repr__ = lambda self: self.name
 
 
 def with_pages(app, name: str, source: list[str]) -> None:
-    """The gallery as cards, and what the front page has from the README."""
+    """The gallery as cards, what the front page has from the README, and the chapters of the report."""
     if name == "README":
         source[0] = reading.cards()
+    if name == "benchmarks/report/README":
+        source[0] += reading.chapters(source[0])
     if name == "site/index":
         source[0] = reading.front(source[0]).replace("<!-- version -->", version)
 
@@ -95,8 +101,31 @@ def with_groups(app, page, template, context, doctree) -> None:
         context["furo_navigation_tree"] = reading.in_groups(context["furo_navigation_tree"])
 
 
+def with_description(app, page, template, context, doctree) -> None:
+    """What search engines show of a page: its first sentences."""
+    text = reading.description(doctree) if doctree else about["description"]
+    context["metatags"] = (
+        context.get("metatags", "") + f'<meta name="description" content="{escape(text or about["description"])}">'
+    )
+
+
+def with_late_pictures(app, doctree, page: str) -> None:
+    """A browser loads the pictures of a page, except the first one, when the reader comes near them."""
+    for image in list(doctree.findall(nodes.image))[1:]:
+        image["loading"] = "lazy"
+
+
+def with_notebooks(app, error) -> None:
+    """A notebook and the script beside the page of each demo."""
+    if not error and app.builder.format == "html":
+        reading.write_notebooks(Path(app.outdir))
+
+
 def setup(app):
     """Formulas as MathML, which browsers draw themselves."""
+    app.connect("html-page-context", with_description)
+    app.connect("doctree-resolved", with_late_pictures)
+    app.connect("build-finished", with_notebooks)
     app.connect("source-read", with_pages)
     app.connect("html-page-context", with_groups, priority=900)
     app.connect("autodoc-process-docstring", without_internals, priority=900)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -18,6 +19,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
 
 DEMOS = Path(__file__).parents[1]
+#: Of a demo's page: the notebook and the script.
+DOWNLOADS = """<p>Download: <a href="{name}.ipynb" download>notebook</a>, <a href="{name}.py" download>script</a>.
+Both run in the folder <code>demos</code> of a clone.</p>
+
+"""
 
 
 def options(text: str) -> str:
@@ -88,6 +94,11 @@ def gallery() -> tuple[str, dict[str, tuple[str, list[Entry]]]]:
     return start, found
 
 
+def entries_of_gallery() -> list[Entry]:
+    """All demos of the gallery."""
+    return [entry for _, entries in gallery()[1].values() for entry in entries]
+
+
 def cards() -> str:
     """The page of the gallery: for each group of demos a grid of cards."""
     start, groups = gallery()
@@ -98,6 +109,12 @@ def cards() -> str:
         parts.append(f"## {title}\n\n{about}\n\n::::{{grid}} 1 2 2 3\n:gutter: 3\n\n{inside}::::\n")
         parts.append(f"```{{toctree}}\n:hidden:\n\n{pages}\n```\n")
     return "\n".join(parts)
+
+
+def chapters(text: str) -> str:
+    """The pages to which the first column of a table leads, for the sidebar."""
+    pages = re.findall(r"^\| \[[^]]*\]\((\w+)\.md\)", text, re.MULTILINE)
+    return "\n```{toctree}\n:hidden:\n\n" + "\n".join(pages) + "\n```\n"
 
 
 def in_groups(navigation: str) -> str:
@@ -145,7 +162,8 @@ def demo(text: str) -> NotebookNode:
         run = next((line for line in docstring.splitlines() if line.startswith(("python3 ", "mpirun "))), "")
         title, _, rest = notebook.cells[0].source.partition("\n")
         shown = f"```sh\n{run}\n```\n" if run else ""
-        entry = next((e for _, entries in gallery()[1].values() for e in entries if f"# {e.title}" == title), None)
+        entry = next((e for e in entries_of_gallery() if f"# {e.title}" == title), None)
+        shown += DOWNLOADS.format(name=entry.name) if entry else ""
         pictures = "\n\n".join([*entry.sketch, *entry.pictures]) if entry else ""
         measured = f"**Measured:** {entry.measured}\n" if entry and entry.measured else ""
         notebook.cells[0].source = f"{title}\n{rest}\n\n{pictures}\n\n{measured}\n{shown}\n{options(text)}"
@@ -153,6 +171,26 @@ def demo(text: str) -> NotebookNode:
         if cell.cell_type == "code" and machinery(cell.source):
             cell.metadata["tags"] = ["hide-input"]
     return notebook
+
+
+def write_notebooks(folder: Path) -> None:
+    """The demos of the gallery as notebooks, which run in the folder ``demos`` of a clone, and as the scripts that they are."""
+    for entry in entries_of_gallery():
+        script = DEMOS / f"{entry.name}.py"
+        notebook = jupytext.reads(script.read_text(encoding="utf-8"), fmt="py:percent")
+        first = notebook.cells[0]
+        if first.cell_type == "code" and first.source.startswith('"""'):
+            first.source = f"__doc__ = {first.source}"
+        notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+        jupytext.write(notebook, folder / f"{entry.name}.ipynb")
+        shutil.copy(script, folder)
+
+
+def description(doctree: nodes.document) -> str:
+    """The beginning of a page's first paragraph that is more than a few words, up to 160 characters."""
+    texts = (" ".join(found.astext().split()) for found in doctree.findall(nodes.paragraph))
+    text = next((text for text in texts if len(text) > 40), "")
+    return text if len(text) <= 160 else text[:157].rsplit(" ", 1)[0].rstrip(",;:") + " ..."
 
 
 def formula(writer, node: nodes.math | nodes.math_block) -> None:

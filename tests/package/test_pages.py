@@ -1,10 +1,13 @@
-"""Scripts of the how-to pages run as they stand there, and give the answers that the pages name."""
+"""Scripts of the how-to pages run as they stand there, and give the answers that the pages name; lists of pages are whole."""
 
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
+from types import ModuleType
 
+import common
 import numpy as np
 import pytest
 
@@ -42,3 +45,40 @@ def test_phase_field():
         d = E * size * eps**2 / (Gc + E * size * eps**2)
         assert force == pytest.approx((1 - d) ** 2 * E * eps, rel=1e-7)
     assert np.argmax([force for _, force in known["forces"]]) == 5
+
+
+def read(name):
+    return (SITE.parent / f"{name}.md").read_text(encoding="utf-8")
+
+
+def test_each_feature_has_a_page():
+    """Each entry of the features links to a page of its own, under a heading."""
+    groups = re.split(r"^## .*$", read("features"), flags=re.MULTILINE)[1:]
+    entries = [entry for group in groups for entry in re.split(r"^- ", group, flags=re.MULTILINE)[1:]]
+    assert len(groups) > 5 and len(entries) > 30 and len(entries) == len(re.findall(r"^- ", read("features"), re.MULTILINE))
+    assert [entry[:60] for entry in entries if not re.search(r"\]\(\w+/\w+\.md", entry)] == []
+
+
+@pytest.mark.parametrize("name", ["explanation/limits", "howto/index"])
+def test_long_lists_have_groups(name):
+    groups = re.split(r"^## .*$", read(name), flags=re.MULTILINE)
+    assert len(groups) > 5 and not re.search(r"^- ", groups[0], re.MULTILINE)
+    assert max(len(re.findall(r"^- |^\w+$", group, re.MULTILINE)) for group in groups) <= 10
+
+
+def test_index_of_how_to_has_each_page_once():
+    listed = re.findall(r"^\w+$", read("howto/index"), re.MULTILINE)
+    assert sorted(listed) == sorted(path.stem for path in SITE.glob("*.md") if path.stem != "index")
+
+
+def test_report_lists_its_chapters():
+    report = SITE.parents[1] / "benchmarks" / "report"
+    listed = re.findall(r"^\| \[.*?\]\((\w+)\.md\)", (report / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(path.stem for path in report.glob("*.md") if path.stem != "README")
+
+
+def test_demo_in_a_notebook(monkeypatch):
+    """In a notebook a demo has its defaults; the command line there is the kernel's."""
+    monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+    monkeypatch.setattr(sys, "argv", ["ipykernel_launcher.py", "-f", "kernel.json"])
+    assert common.arguments("A demo.", n=3).n == 3

@@ -19,7 +19,7 @@ from uem_dolfinx.parallel import agreed
 
 
 class MeanMotion(given.Sealed):
-    """The mean of a displacement component over a part: ``integral of c . u / integral of 1 = b``.
+    """The mean of a displacement component over a part: ``integral of inner(c, u) / integral of 1 = b``.
 
         uem.MeanMotion(tags["top"], (0, 1), b=-0.01)                    # the top is lowered by 0.01 in the mean, and stays free to bend
 

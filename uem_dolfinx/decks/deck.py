@@ -327,10 +327,6 @@ def _soft(law: Interaction) -> SoftContact:
 def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
     """Read a deck of Abaqus or CalculiX with its materials, conditions, contacts, steps and loads as a problem (collective).
 
-        deck = uem.read_deck("ring1.inp", comm)
-        for step in deck.run():
-            print(step, deck.displacement(10))
-
     Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
     ``*BOUNDARY``, ``*CLOAD``, pressures by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``, ``*CONTACT PAIR``, ``*TIE``,
     ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*MODEL CHANGE`` of contact pairs and ``*PRE-TENSION SECTION``, whose surface is cut; steps

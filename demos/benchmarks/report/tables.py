@@ -1,4 +1,4 @@
-"""Writes the tables of README.md here from the JSON files beside it, between the marks that name them.
+"""Writes the tables of the pages here from the JSON files beside it, between the marks that name them.
 
 python3 demos/benchmarks/report/tables.py
 
@@ -50,5 +50,5 @@ def fill(match: re.Match[str]) -> str:
 
 
 if __name__ == "__main__":
-    page = HERE / "README.md"
-    page.write_text(MARK.sub(fill, page.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in HERE.glob("*.md"):
+        page.write_text(MARK.sub(fill, page.read_text(encoding="utf-8")), encoding="utf-8")
