@@ -178,6 +178,10 @@ def test_statics_has_no_speed():
     raised(uem.InputError, "contact 'sole': Stribeck needs the speed of slip", lambda: problem(uem.Stribeck(0.3, 0.2, 0.1)))
     problem(uem.Stribeck(0.3, 0.2))
     raised(uem.InputError, "contact 'sole': ViscousFriction needs the speed", lambda: problem(uem.ViscousFriction(1.0)))
+    film = uem.Contact(s.tag("low", 0, at(1, 0.0)), uem.RigidPlane([0.0, 0.0], [0.0, 1.0]), friction=uem.ViscousFriction(1.0))
+    explicit = uem.Dynamics(uem.lumped_mass(u.function_space, 1.0), scheme=uem.CentralDifferences())
+    words = r"ViscousFriction\(field=1.0, mu=inf\), which does not go with CentralDifferences"
+    raised(uem.InputError, words, lambda: uem.UnitedProblem(linear(u, 1.0), u, contacts=[film], dynamics=explicit))
     raised(uem.InputError, "eta = -0.1", lambda: uem.ViscousFriction(-0.1))
     raised(uem.InputError, "mu = 0", lambda: uem.ViscousFriction(1.0, mu=0.0))
     raised(uem.InputError, "kinetic = -0.1", lambda: uem.Stribeck(0.3, -0.1))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from uem_dolfinx.contact.general.general import GeneralContact
+from uem_dolfinx.contact.laws.viscous import ViscousFriction
 from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
 from uem_dolfinx.errors import InputError
 
@@ -54,6 +55,10 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
             )
         if getattr(contact, "heats", ()):
             raise InputError(f"{name} conducts heat, which does not go with CentralDifferences: {remedy}")
+        friction = getattr(contact, "friction", None)
+        for law in friction.values() if isinstance(friction, Mapping) else (friction,):
+            if isinstance(law, ViscousFriction):
+                raise InputError(f"{name} has friction = {law!r}, which does not go with CentralDifferences: {remedy}")
         for what in ("normal", "cohesion", "leak"):
             if law := getattr(contact, what, None):
                 raise InputError(f"{name} has {what} = {law!r}, which does not go with CentralDifferences: {remedy}")
