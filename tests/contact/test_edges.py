@@ -9,6 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import ufl
+from benchmarks.scenes import box
 from block_scenes import st_venant
 from dolfinx import fem
 from edge_scenes import COMM, E, crossed, rod, rods, roofs, turned
@@ -239,3 +241,63 @@ def test_refused():
         refused(uem.InputError, ["edges = True", word], lambda more={word: value}: uem.GeneralContact(edges=True, **more))
         assert not uem.GeneralContact(**{word: value}).edges
     refused(uem.InputTypeError, ["edges", "True or False"], lambda: uem.GeneralContact(edges="yes"))
+
+
+def dragged(steps, first=None):
+    """A rod on edge that is pressed onto another one, and then dragged along three of its pieces (collective)."""
+    r = rods((11, 12), length=12.0, law=st_venant, friction=0.3, way=(0.0, 0.0, 0.0), first=first)
+    low, high = (bc.g for bc in r.problem.bodies.bcs)
+
+    def load(t):
+        high.value[:] = [3.0 * max(0.0, 2.0 * t - 1.0), 0.0, -0.3 * min(1.0, 2.0 * t)]
+
+    r.problem.load = load
+    run(r.problem, 2 * steps)
+    assert not low.value.any()
+    return r
+
+
+def test_from_piece_to_piece():
+    """A crossing that slides on to the next nodes keeps its friction: force and dissipation know nothing of steps or order."""
+    fine = dragged(12)
+    for r in (dragged(6), dragged(12, first=1), dragged(12, first=0)):
+        assert np.abs(r.force - fine.force).max() < 1e-7
+    one, other = (dragged(12, first=k).edges[0].dissipation for k in (0, 1))
+    assert one == pytest.approx(other, rel=1e-8)
+
+
+@pytest.mark.parametrize("angle", [0.25 * np.pi, slow(0.3), slow(1.0)])
+def test_a_box_on_a_box(angle):
+    """Turned: at crossings of edges where no node is near, too; forces on coarse meshes are nearer to those on fine ones."""
+    forces = []
+    for n, edges in ((8, True), (4, True), (4, False)):
+        held = [lambda x: np.abs(x[:, 2] + 1.0) < 1e-9, lambda x: np.abs(x[:, 2] - 1.0) < 1e-9]
+        low, high = (box("hexahedron", (-1.0, -1.0, k - 1.0), (1.0, 1.0, k), (n, n, n // 2)) for k in (0.0, 1.0))
+        turn = np.array([[np.cos(angle), np.sin(angle), 0.0], [-np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+        r = crossed("hexahedron", [low, high.mapped(lambda x, R=turn: x @ R)], held, (0.0, 0.0, -0.02), edges=edges)
+        run(r.problem)
+        assert side(r.force) < 1e-6
+        forces.append(r.force[2])
+    assert forces[1] == pytest.approx(forces[0], rel=0.04)
+    assert abs(forces[1] - forces[0]) < abs(forces[2] - forces[0]) or angle < 0.7
+
+
+def test_gradient():
+    """The derivative by one rod's modulus, through a crossing that moves along both edges, is that of differences."""
+
+    def solved(modulus):
+        kept = []
+
+        def law(u, E):
+            mesh = u.function_space.mesh
+            kept.append(fem.Constant(mesh, modulus))
+            return st_venant(u, ufl.conditional(ufl.lt(ufl.SpatialCoordinate(mesh)[2], 0.0), kept[0], E))
+
+        r = rods((11, 12), length=12.0, angle=1.0, along=(0.7, 1.3), way=(0.0, 0.0, -0.5), law=law)
+        run(r.problem, 2)
+        return r, (r.u[0] ** 2 + r.u[1] * r.u[2]) * ufl.dx, kept[0]
+
+    r, J, control = solved(E)
+    (found,), h = uem.gradient(r.problem, J, [control]), 1.0
+    ahead, back = (uem.integrate(solved(E + step)[1]) for step in (h, -h))
+    assert float(found) == pytest.approx((ahead - back) / (2 * h), rel=1e-5)
