@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import create_unit_square, locate_entities_boundary
 from helpers import M, blocks, clamp, highest, linear, modulus, refused, slow
 from restart_scenes import COMM, Killed, bits
 
@@ -326,3 +327,24 @@ def test_a_driven_tool_is_let_go(coupling):
             led = pushed
         elif step.step == "let go":
             assert pushed == pytest.approx(led * (1.0 - step.factor), abs=1e-10)
+
+
+def test_released_without_contact():
+    """A released side of a body without contact moves to its equilibrium in one iteration, with the matrix of the new conditions."""
+    mesh = create_unit_square(COMM, 2, 2)
+    V = uem.function_space(mesh, 1, (2,))
+    u, v, p = fem.Function(V), ufl.TestFunction(V), fem.Constant(mesh, 0.0)
+    F = uem.LinearElastic(2.0, 0.0, kind="plane_strain").residual(u, v) * ufl.dx
+    sides = [locate_entities_boundary(mesh, 1, lambda x, at=at: np.isclose(x[1], at)) for at in (0.0, 1.0)]
+    F += p * v[1] * forms.surface_measure(mesh, sides[1])
+    bottom, top = (
+        fem.dirichletbc(np.array([0.0, way]), fem.locate_dofs_topological(V, 1, side), V)
+        for way, side in zip((0.0, -0.01), sides)
+    )
+    for pressure in (0.0, 0.01):
+        u.x.array[:] = 0.0
+        problem = uem.UnitedProblem(F, u, bcs=[bottom, top])
+        for step in uem.load_steps(problem, [uem.Step("press"), uem.Step("let go", bcs=[bottom], loads={p: pressure})]):
+            assert len(step.iterations) <= 2 and step.cuts == 0
+        assert highest(COMM, -u.x.array.min()) == pytest.approx(pressure / 2.0, abs=1e-14)
+        p.value = 0.0
