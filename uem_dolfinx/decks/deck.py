@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from mpi4py import MPI
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import exterior_facet_indices
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Ints
@@ -23,7 +25,7 @@ from uem_dolfinx.contact.laws.exponential import Exponential
 from uem_dolfinx.contact.laws.soft import SoftContact
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.decks.model import TEMPERATURE, Interaction, Model, Pair, Step, model_of
-from uem_dolfinx.errors import InputError, MissingFileError, TagError
+from uem_dolfinx.errors import InputError, MissingFileError, SpaceError, TagError
 from uem_dolfinx.geometry.axisymmetry import axisymmetric
 from uem_dolfinx.geometry.cuts import BACK, cut
 from uem_dolfinx.geometry.decks import found_of, read_numbers
@@ -32,7 +34,7 @@ from uem_dolfinx.geometry.mesh_files import raw_of
 from uem_dolfinx.geometry.raw import RawMesh
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
-from uem_dolfinx.materials.elastic import Elastic, LinearElastic, StVenantKirchhoff
+from uem_dolfinx.materials.elastic import LinearElastic, StVenantKirchhoff
 from uem_dolfinx.output.xdmf import geometry_degree
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.scripting import dirichlet, ds, dx
@@ -216,17 +218,18 @@ class Deck(given.Sealed):
         return Equation([(self._tag(name), c * axes[dof - 1]) for name, dof, c in terms])
 
     def _point_loads(self) -> list[PointLoad]:
-        g, found = self.mesh.geometry.dim, []
+        g, t, found = self.mesh.geometry.dim, self._model.thickness, []
         for name in dict.fromkeys(name for step in self.steps for name, _ in step.forces if not self._is_reference(name)):
             force = fem.Constant(self.mesh, np.zeros(g))
-            self._drive(force.value, [np.array([s.forces.get((name, c), 0.0) for c in range(1, g + 1)]) for s in self.steps])
+            self._drive(force.value, [np.array([s.forces.get((name, c), 0.0) / t for c in range(1, g + 1)]) for s in self.steps])
             found.append(PointLoad(self._tag(name), force))
         return found
 
     def _section(self, name: str, node: str, axis: list[float]) -> Preload:
         g, reference, now = self.mesh.geometry.dim, (f"node {int(node)}", 1), np.zeros(1)
         pulled = any(reference in step.forces for step in self.steps)
-        self._drive(now, [(step.forces if pulled else step.held).get(reference, 0.0) for step in self.steps])
+        t = self._model.thickness if pulled else 1.0
+        self._drive(now, [(step.forces if pulled else step.held).get(reference, 0.0) / t for step in self.steps])
         led: dict[str, Any] = {"force" if pulled else "shortening": lambda s: float(now[0])}
         direction = axis[:g] if any(axis[:g]) else None
         return Preload(self._tag(name), self._tag(BACK.format(name)), direction, coupling="mortar", name=name, **led)
@@ -265,7 +268,7 @@ class Deck(given.Sealed):
             if material.elastic is None:
                 raise InputError(f"material '{name}' has no *ELASTIC: expected E and nu of an isotropic material")
             law = law_of(*material.elastic, kind=self._kind)  # type: ignore[arg-type]
-            F += law.residual_form(self.u, v, cells) if not thermal and self._locks(law) else law.residual(w, v) * cells
+            F += law.residual(w, v) * cells
             if material.expansion and heating is not None:
                 F -= law.thermal_residual(w, v, material.expansion * heating) * cells
             if thermal:
@@ -273,16 +276,24 @@ class Deck(given.Sealed):
                 F += ((material.conductivity or 0.0) * ufl.inner(ufl.grad(T), ufl.grad(q)) + stored * q) * cells
         for where in dict.fromkeys(where for step in self.steps for where in step.pressures):
             pressed = self._driven_by("pressures", where) * ufl.dot(ufl.FacetNormal(self.mesh), v)
-            F += pressed * ds(self._tag(where[0]))
+            F += pressed * ds(self._outside(self._tag(where[0])))
         return F
 
-    def _locks(self, law: Elastic) -> bool:
-        """Whether CalculiX' elements of this type integrate the change of volume with fewer points."""
-        cell, degree = compat.cell_name(self.mesh), geometry_degree(self.mesh)
-        return degree == 1 and cell in ("quadrilateral", "hexahedron") and law.kind in ("3d", "plane_strain")
+    def _outside(self, tag: Tag) -> Tag:
+        """A surface that is pressed; InputError if it has sides between two elements."""
+        own = tag.entities[tag.entities < self.mesh.topology.index_map(tag.dim).size_local]
+        outer = np.asarray(exterior_facet_indices(self.mesh.topology)) if tag.dim == self.mesh.topology.dim - 1 else own
+        if reduced(self.mesh.comm, not np.isin(own, outer).all(), op=MPI.LOR):
+            raise InputError(
+                f"a pressure acts on sides between two elements, among those of {tag}: expected sides of one element each"
+            )
+        return tag
 
     def _heating(self, T: Any) -> Any:
-        """Temperatures above those at the start, linear in cells where they are prescribed; None if they play no part."""
+        """Temperatures above those at the start; None if they play no part.
+
+        Prescribed ones are linear in cells, but for quadrilaterals and hexahedra of degree 1, which have the mean of their vertices.
+        """
         if self._model.thermal and all(step.kind == "HEAT TRANSFER" for step in self.steps):
             return None
         V = compat.function_space(self.mesh, 1)
@@ -293,21 +304,25 @@ class Deck(given.Sealed):
             return T - start
         if not any(step.temperatures for step in self.steps):
             return None
-        now = fem.Function(V)
-        now.x.array[:] = start.x.array
-        values = []
+        means = geometry_degree(self.mesh) == 1 and compat.cell_name(self.mesh) in ("quadrilateral", "hexahedron")
+        warmer, values = fem.Function(compat.function_space(self.mesh, ("DG", 0)) if means else V), []
         for step in self.steps:
             there = fem.Function(V)
             there.x.array[:] = start.x.array
             self._warm(there, step.temperatures)
-            values.append(np.array(there.x.array))
-        self._drive(now.x.array, values)
-        return now - start
+            there.x.array[:] -= start.x.array
+            warmer.interpolate(there)
+            values.append(np.array(warmer.x.array))
+        warmer.x.array[:] = 0.0
+        self._drive(warmer.x.array, values)
+        return warmer
 
     def _warm(self, field: fem.Function, temperatures: dict[str, float]) -> None:
         """Set temperatures at the nodes of sets (collective)."""
         for name, value in temperatures.items():
-            field.x.array[compat.bc_dofs(dirichlet(field.function_space, self._tag(name)))[0]] = value
+            # nodes in the middle of edges play no part
+            with suppress(SpaceError):
+                field.x.array[compat.bc_dofs(dirichlet(field.function_space, self._tag(name)))[0]] = value
         field.x.scatter_forward()
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -16,12 +17,25 @@ OUTPUT = (
 )  # fmt: skip
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
 KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True}
+#: Element types that lack nodes in the middle of faces and cells, or are integrated with fewer points or with incompatible modes.
+OTHERWISE = r"\d[RI]|C3D20|C(PS|PE|AX)8"
+#: Options that are taken, or that change nothing here; all others are left out.
+OPTIONS = {
+    "ELASTIC": "TYPE", "EXPANSION": "TYPE ZERO", "SOLID SECTION": "ELSET MATERIAL ORIENTATION OFFSET", "MATERIAL": "NAME",
+    "SURFACE INTERACTION": "NAME", "SURFACE BEHAVIOR": "PRESSURE-OVERCLOSURE", "CONTACT PAIR": "INTERACTION TYPE ADJUST SMALL_SLIDING",
+    "TIE": "NAME POSITION_TOLERANCE ADJUST", "PRE-TENSION SECTION": "SURFACE NODE", "INITIAL CONDITIONS": "TYPE",
+    "STEP": "INC NLGEOM NAME", "BOUNDARY": "OP", "CLOAD": "OP", "DLOAD": "OP", "DSLOAD": "OP", "TEMPERATURE": "OP",
+    "MODEL CHANGE": "TYPE ADD REMOVE", "STATIC": "SOLVER DIRECT", "HEAT TRANSFER": "SOLVER DIRECT STEADY_STATE",
+    "COUPLED TEMPERATURE-DISPLACEMENT": "SOLVER DIRECT STEADY_STATE",
+}  # fmt: skip
 #: Number of the temperature among the degrees of freedom.
 #: [format; number; -]
 TEMPERATURE = 11
 
 #: A set or a node, by name, and a degree of freedom, or the label of a load.
 Where: TypeAlias = tuple[str, Any]
+#: Values at single nodes, or sides of elements, in turn with the same of a step.
+Acting: TypeAlias = dict[tuple[Any, Any], float]
 
 
 @dataclass
@@ -80,6 +94,7 @@ class Model:
 
     Attributes:
         sections: set of elements and material of each section.
+        thickness: of plane bodies.
         equations: lists of node, degree of freedom and coefficient.
         initial: temperatures at the start, by set or node.
         pretension: surface, reference node and axis of each section of a bolt.
@@ -90,6 +105,7 @@ class Model:
     materials: dict[str, Material] = field(default_factory=dict)
     interactions: dict[str, Interaction] = field(default_factory=dict)
     sections: list[tuple[str, str]] = field(default_factory=list)
+    thickness: float = 1.0
     pairs: list[Pair] = field(default_factory=list)
     equations: list[list[tuple[str, int, float]]] = field(default_factory=list)
     initial: dict[str, float] = field(default_factory=dict)
@@ -109,7 +125,10 @@ class _Reader:
     def __init__(self, deck: Deck):
         self.model, self._deck = Model(types=deck.types), deck
         self._material, self._interaction, self._begin = Material(), Interaction(), Step()
-        self._step = self._begin
+        self._step, self._dim = self._begin, 3 if any(name.startswith("C3D") for name in deck.types) else 2
+        #: Kinds of conditions of this step, and what they have set.
+        self._met, self._own = set[str](), set[tuple[str, Any, Any]]()
+        self._sets: dict[tuple[str, int], None] = {}
         self._readers: dict[str, Callable[[dict[str, str], list[list[str]]], bool | None]] = {
             "MATERIAL": self._of_material, "ELASTIC": self._elastic, "DENSITY": self._number("density"),
             "EXPANSION": self._number("expansion"), "CONDUCTIVITY": self._number("conductivity"),
@@ -139,18 +158,25 @@ class _Reader:
         self._material = self.model.materials.setdefault(options["NAME"].upper(), Material())
 
     def _elastic(self, options: dict[str, str], rows: list[list[str]]) -> bool:
+        _isotropic(options)
         E, nu = _numbers(rows[0])[:2]
         self._material.elastic = E, nu
-        return options.get("TYPE", "ISO").upper().startswith("ISO") and len(rows) == 1
+        return len(rows) == 1
 
     def _number(self, what: str) -> Callable[[dict[str, str], list[list[str]]], bool]:
         def read(options: dict[str, str], rows: list[list[str]]) -> bool:
+            _isotropic(options)
             setattr(self._material, what, _numbers(rows[0])[0])
             return len(rows) == 1
 
         return read
 
     def _section(self, options: dict[str, str], rows: list[list[str]]) -> None:
+        plane = any(name.startswith(("CPS", "CPE")) for name in self.model.types)
+        t = (plane and rows and _numbers(rows[0])[0]) or 1.0
+        if self.model.sections and t != self.model.thickness:
+            raise InputError(f"thicknesses {self.model.thickness} and {t}: expected one for all plane bodies")
+        self.model.thickness = t
         self.model.sections.append((options["ELSET"].upper(), options["MATERIAL"].upper()))
 
     def _of_interaction(self, options: dict[str, str], rows: list[list[str]]) -> None:
@@ -179,9 +205,12 @@ class _Reader:
                 )
             )  # fmt: skip
 
-    def _tie(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def _tie(self, options: dict[str, str], rows: list[list[str]]) -> bool:
+        if "CYCLIC SYMMETRY" in options or "MULTISTAGE" in options:
+            return False
         reach = options.get("POSITION TOLERANCE")
         self.model.pairs += [Pair(row[0], row[1], adjust=float(reach) if reach else None, tied=True) for row in rows]
+        return True
 
     def _equation(self, options: dict[str, str], rows: list[list[str]]) -> None:
         left = [value for row in rows for value in row if value]
@@ -197,59 +226,74 @@ class _Reader:
     def _initial(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         if options["TYPE"].upper() != "TEMPERATURE":
             return False
-        self.model.initial |= {self._node(row[0]): _numbers(row[1:])[0] for row in rows}
+        _last(self.model.initial, {self._node(row[0]): _numbers(row[1:])[0] for row in rows})
         return True
 
     # -- steps -----------------------------------------------------------------------------------------------------------
 
     def _new_step(self, options: dict[str, str], rows: list[list[str]]) -> None:
         last = self.model.steps[-1] if self.model.steps else self._begin
+        self._met, self._own = set(), set()
         self._step = Step(
             nlgeom="NLGEOM" in options and options["NLGEOM"].upper() != "NO", held=dict(last.held), forces=dict(last.forces),
             pressures=dict(last.pressures), temperatures=dict(last.temperatures),
         )  # fmt: skip
 
+    def _begins(self, kind: str, acting: dict[Any, float], options: dict[str, str]) -> None:
+        """Let the first keyword of a kind in a step end what acted before, with ``OP=NEW``."""
+        if options.get("OP", "MOD").upper() == "NEW" and kind not in self._met:
+            acting.clear()
+        self._met.add(kind)
+
+    def _add(self, kind: str, acting: Acting, where: tuple[Any, Any], value: float) -> None:
+        """A load replaces that of steps before, and adds to others of its step."""
+        acting[where] = value + (acting[where] if (kind, *where) in self._own else 0.0)
+        self._own.add((kind, *where))
+
+    def _has(self, dof: int, value: float, keyword: str) -> bool:
+        """Whether bodies have a degree of freedom; rotations, and motions out of the plane, are none."""
+        if dof <= self._dim or (dof == TEMPERATURE and self.model.thermal):
+            if dof < 1:
+                raise InputError(f"degree of freedom {dof}: expected 1 to {self._dim}, or {TEMPERATURE}, the temperature")
+            return True
+        if value:
+            self.model.left_out.append(f"degree of freedom {dof} of *{keyword}: the bodies have none such")
+        return False
+
     def _boundary(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        held = self._step.held
-        if options.get("OP", "MOD").upper() == "NEW":
-            held.clear()
-            held |= self._begin.held
+        if "FIXED" in options:
+            raise InputError("FIXED holds displacements that steps before have reached: expected values")
+        self._begins("BOUNDARY", self._step.held, options)
         for row in rows:
             where, first, last, value = [*row, "", ""][:4]
             for dof in range(int(first), int(last or first) + 1):
-                held[self._node(where), dof] = _numbers([value])[0]
+                if self._has(dof, _numbers([value])[0], "BOUNDARY"):
+                    self._sets[where, dof] = None
+                    self._step.held |= {(one, dof): _numbers([value])[0] for one in self._nodes(where)}
 
     def _cload(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        if options.get("OP", "MOD").upper() == "NEW":
-            self._step.forces.clear()
+        self._begins("CLOAD", self._step.forces, options)
         for where, dof, value in (row[:3] for row in rows):
-            name = self._node(where)
-            if name == where and name.upper() in self._deck.nsets:
-                # a set may be a surface, and these are forces at its nodes
-                name = f"nodes of {where}"
-                self._deck.nsets[name.upper()] = (name, self._deck.nsets[where.upper()][1])
-                self._deck.loaded.add(name)
-            self._step.forces[name, int(dof)] = _numbers([value])[0]
+            if self._has(int(dof), _numbers([value])[0], "CLOAD"):
+                for one in self._nodes(where):
+                    self._add("CLOAD", self._step.forces, (one, int(dof)), _numbers([value])[0])
 
     def _dload(self, options: dict[str, str], rows: list[list[str]]) -> bool:
-        pressures = self._step.pressures
-        if options.get("OP", "MOD").upper() == "NEW":
-            pressures.clear()
-        pressing = [row for row in rows if row[1].upper().startswith("P") and row[1].upper() != "PNU"]
-        for value in dict.fromkeys(row[2] for row in pressing):
-            sides = [[row[0], f"S{row[1][1:]}" if len(row[1]) > 1 else ""] for row in pressing if row[2] == value]
-            # sides with one pressure are one surface
-            same = [name for name, (_, own) in self._deck.surfaces.items() if name.startswith("pressed ") and own == sides]
-            name = (
-                sides[0][0] if len(sides) == 1 and not sides[0][1] else same[0] if same else f"pressed {len(self._deck.surfaces)}"
-            )
-            if name.startswith("pressed "):
-                self._deck.surfaces[name] = (True, sides)
-            pressures[name, "P"] = _numbers([value])[0]
+        self._begins("DLOAD", self._step.pressures, options)
+        pressing = [row for row in rows if re.fullmatch(r"P\d?", row[1].upper())]
+        for who, label, value in (row[:3] for row in pressing):
+            of_elements, sides = self._deck.surfaces.get(who, (False, []))
+            if label[1:] or not (of_elements and all(side for _, side in sides)):
+                sides = [[who, f"S{label[1:]}" if label[1:] else ""]]
+            for member, side in sides:
+                own = self._deck.elsets.get(member.upper(), ("", [member]))[1] if side else [member]
+                for one in own:
+                    self._add("DLOAD", self._step.pressures, (str(one), side.upper()), _numbers([value])[0])
         return len(pressing) == len(rows)
 
     def _temperature(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        self._step.temperatures |= {self._node(row[0]): _numbers(row[1:])[0] for row in rows}
+        self._begins("TEMPERATURE", self._step.temperatures, options)
+        _last(self._step.temperatures, {self._node(row[0]): _numbers(row[1:])[0] for row in rows})
 
     def _change(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         if options.get("TYPE", "").upper() != "CONTACT PAIR":
@@ -263,6 +307,96 @@ class _Reader:
             return where
         # reference nodes of sections belong to no body
         return self._deck.name_node(int(where)) if int(where) in self._deck.nodes else f"node {int(where)}"
+
+    def _nodes(self, where: str) -> list[Any]:
+        """Nodes of a set or a node by their numbers, or the name of a set that there is not."""
+        return [int(where)] if where.isdigit() else self._deck.nsets.get(where.upper(), ("", [where]))[1]
+
+    # -- after all keywords ----------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Let values at single nodes and sides be those of sets, and check that elements have materials."""
+        steps, deck = self.model.steps, self._deck
+        known = [deck.elsets[name][1] for name, _ in self.model.sections if name in deck.elsets]
+        if len(known) == len(self.model.sections) and (bare := set(deck.elements).difference(*known)):
+            raise InputError(f"element {min(bare)} has no *SOLID SECTION: expected a material of all elements")
+        held, forces, pressures = ([getattr(step, what) for step in steps] for what in ("held", "forces", "pressures"))
+        for step in steps:
+            step.held, step.forces, step.pressures = {}, {}, {}
+        for (where, dof), history in self._in_sets(held):
+            self._give("held", (self._named("held", where), dof), history)
+        by_node: dict[Any, dict[int, list[float | None]]] = {}
+        for (one, dof), history in _histories(forces).items():
+            by_node.setdefault(one, {})[dof] = history
+        for nodes in _alike(by_node):
+            name = self._named("loaded", nodes)
+            for dof, history in by_node[nodes[0]].items():
+                self._give("forces", (name, dof), history)
+        of_sides = _histories(pressures)
+        for group in _alike(of_sides):
+            name = group[0][0] if not group[0][1] else f"pressed {len(deck.surfaces)}"
+            if group[0][1]:
+                deck.surfaces[name] = (True, [list(side) for side in group])
+            self._give("pressures", (name, "P"), of_sides[group[0]])
+
+    def _give(self, what: str, where: Where, history: list[float | None]) -> None:
+        for step, value in zip(self.model.steps, history):
+            if value is not None:
+                getattr(step, what)[where] = value
+
+    def _in_sets(self, held: list[Acting]) -> Iterator[tuple[tuple[Any, int], list[float | None]]]:
+        """Sets of the file that have one history each, and what is left, in sets of nodes with the same history."""
+        left = by_node = _histories(held)
+        for where, dof in self._sets:
+            nodes = self._nodes(where)
+            # reference nodes of sections are no nodes of a body
+            if all(by_node.get((one, dof)) == by_node.get((nodes[0], dof)) is not None for one in nodes):
+                yield (where if not where.isdigit() else [int(where)], dof), by_node[nodes[0], dof]
+                left = {at: history for at, history in left.items() if at[1] != dof or at[0] not in set(nodes)}
+        for dof in dict.fromkeys(dof for _, dof in left):
+            of_dof = {one: history for (one, other), history in left.items() if other == dof}
+            for nodes in _alike(of_dof):
+                yield (nodes, dof), of_dof[nodes[0]]
+
+    def _named(self, what: str, nodes: Any) -> str:
+        """The name of a set of these nodes, which is made if there is none."""
+        if isinstance(nodes, str) or isinstance(nodes[0], str):
+            return nodes if isinstance(nodes, str) else nodes[0]
+        if len(nodes) == 1:
+            return self._node(str(nodes[0]))
+        name = f"{what} {len(self._deck.nsets)}"
+        self._deck.nsets[name.upper()] = (name, nodes)
+        if what == "loaded":
+            # a set may be a surface, and these are forces at its nodes
+            self._deck.loaded.add(name)
+        return name
+
+
+def _histories(acting: list[Acting]) -> dict[Any, list[float | None]]:
+    """Values in all steps, by their places; None where there is none."""
+    return {at: [one.get(at) for one in acting] for at in dict.fromkeys(at for one in acting for at in one)}
+
+
+def _alike(histories: dict[Any, Any]) -> list[list[Any]]:
+    """Places with the same values; a name has a list of its own."""
+    found: dict[str, list[Any]] = {}
+    for at, history in histories.items():
+        named = isinstance(at, str) or (isinstance(at, tuple) and not at[1])
+        found.setdefault(f"{at if named else ''} {history}", []).append(at)
+    return list(found.values())
+
+
+def _last(values: dict[str, float], more: dict[str, float]) -> None:
+    """Let more values follow all others: sets may have nodes in common."""
+    for name, value in more.items():
+        values.pop(name, None)
+        values[name] = value
+
+
+def _isotropic(options: dict[str, str]) -> None:
+    """InputError for another type than that of an isotropic material."""
+    if not (kind := options.get("TYPE", "ISO").upper()).startswith("ISO"):
+        raise InputError(f"TYPE={kind}: expected ISO, an isotropic material")
 
 
 def model_of(deck: Deck) -> Model:
@@ -282,11 +416,17 @@ def model_of(deck: Deck) -> Model:
             raise InputError(f"cannot read *{keyword} {', '.join(f'{k}={v}' for k, v in options.items())}: {error}") from error
         if not taken:
             left_out.append(f"*{keyword}")
-        elif "AMPLITUDE" in options:
-            left_out.append(f"AMPLITUDE of *{keyword}: values grow in proportion to the time of the step")
-    left_out[:] = dict.fromkeys(left_out)
+            continue
+        unknown = [name for name in options if name and name.replace(" ", "_") not in OPTIONS.get(keyword, "").split()]
+        grow = ": values grow in proportion to the time of the step"
+        left_out += [f"{name} of *{keyword}{grow if name == 'AMPLITUDE' else ''}" for name in unknown]
+    left_out += [f"{name}: complete cells, integrated fully" for name in sorted(deck.types) if re.search(OTHERWISE, name)]
+    if reader.model.thickness != 1.0:
+        left_out.append(f"thickness {reader.model.thickness}: forces of contacts and sections are those of a thickness of 1")
     if not reader.model.steps:
         raise InputError(f"the deck has no step that can be taken: expected *STEP with one of {', '.join(KINDS)}")
+    reader.close()
+    left_out[:] = dict.fromkeys(left_out)
     return reader.model
 
 

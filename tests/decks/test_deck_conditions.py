@@ -1,0 +1,157 @@
+"""Conditions of decks: values at nodes that sets have in common, within a step and from step to step; elements, and what is said.
+
+Read first: ``test_forces``.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from deck_scenes import columns, written
+from helpers import refused
+
+import uem_dolfinx as uem
+
+COMM = MPI.COMM_WORLD
+E, ALPHA = 1000.0, 1e-5
+STEEL = f"*MATERIAL, NAME=STEEL\n*ELASTIC\n{E}, {{}}\n*EXPANSION\n{ALPHA}\n*SOLID SECTION, ELSET=body 1, MATERIAL=STEEL\n"
+HELD = "*BOUNDARY\nfoot 1, 3, 6\n101, 1, 2\n102, 2\n"
+FLAT = "*BOUNDARY\nfoot 1, 2, 6\n101, 1\n"
+
+
+def column(*steps, nu=0.3, kind="C3D8", cells=2, thickness="", held=HELD):
+    """A column of height 2 with an area of 1, and steps of these conditions."""
+    start = "*INITIAL CONDITIONS, TYPE=TEMPERATURE\nall, 20.\n"
+    taken = "".join(f"*STEP\n*STATIC\n{step}*END STEP\n" for step in steps)
+    return columns([(0.0, 2.0, cells)], kind) + STEEL.format(nu) + thickness + start + held + taken
+
+
+def read(folder, text):
+    """The deck of this text."""
+    return uem.read_deck(written(folder, text), COMM)
+
+
+def heights(folder, text, node=121):
+    """Displacement of a node along the column at the end of each step, and the deck."""
+    deck = read(folder, text)
+    return [float(deck.displacement(node)[-1]) for _ in deck.run()], deck
+
+
+HEAD, EACH = "head 1, 3, -25.\n", "121, 3, {0}\n122, 3, {0}\n123, 3, {0}\n124, 3, {0}\n"
+FORCES = {
+    "twice in a keyword": ([f"*CLOAD\n{HEAD}{HEAD}"], [200.0]),
+    "in two keywords": ([f"*CLOAD\n{HEAD}*CLOAD\n" + EACH.format(-5.0)], [120.0]),
+    "anew by nodes": ([f"*CLOAD\n{HEAD}", "*CLOAD\n" + EACH.format(-5.0)], [100.0, 20.0]),
+    "new": ([f"*CLOAD\n{HEAD}", "*CLOAD, OP=NEW\n" + EACH.format(-5.0)], [100.0, 20.0]),
+    "new twice": ([f"*CLOAD\n{HEAD}", f"*CLOAD, OP=NEW\n{HEAD}*CLOAD, OP=NEW\n" + EACH.format(-5.0)], [100.0, 120.0]),
+    "none": ([f"*CLOAD\n{HEAD}", "*CLOAD, OP=NEW\n"], [100.0, 0.0]),
+    "no rotations": ([f"*CLOAD\n{HEAD}head 1, 5, 1.\n"], [100.0]),
+}
+
+
+@pytest.mark.parametrize("case", FORCES)
+def test_forces(folder, case):
+    """Forces at a node add within a step, and replace those of steps before; the first OP=NEW of a step ends them."""
+    steps, forces = FORCES[case]
+    found, deck = heights(folder, column(*steps))
+    assert found == pytest.approx([-2 * force / E for force in forces], rel=1e-9, abs=1e-15)
+    assert deck.left_out == (["degree of freedom 5 of *CLOAD: the bodies have none such"] if case == "no rotations" else [])
+
+
+TOP = "*SURFACE, NAME=top\n11, S2\n"
+PRESSURES = {
+    "twice": (["*DLOAD\n11, P2, 1.\n*DLOAD\n11, P2, 2.\n"], [3.0]),
+    "on surfaces": (["*DSLOAD\nover 1, P, 1.\n*DLOAD\n11, P2, 2.\n"], [3.0]),
+    "anew": (["*DSLOAD\nover 1, P, 1.\n", "*DLOAD\n11, P2, 5.\n"], [1.0, 5.0]),
+    "new": (["*DLOAD\n11, P2, 1.\n", "*DLOAD, OP=NEW\n11, P2, 2.\n*DLOAD, OP=NEW\n11, P2, 2.\n"], [1.0, 4.0]),
+}
+
+
+@pytest.mark.parametrize("case", PRESSURES)
+def test_pressures(folder, case):
+    """The same of pressures on sides, of elements as of surfaces."""
+    steps, pressures = PRESSURES[case]
+    assert heights(folder, column(*steps))[0] == pytest.approx([-2 * p / E for p in pressures], rel=1e-9)
+
+
+HOLD = "*BOUNDARY\nhead 1, 3, 3, {}\n"
+HOLDS = {
+    "anew by nodes": ([HOLD.format(-0.01), "*BOUNDARY\n" + EACH.format("3, -0.03")], [-0.01, -0.03]),
+    "anew by a set": (["*BOUNDARY\n" + EACH.format("3, -0.03"), HOLD.format(-0.01)], [-0.03, -0.01]),
+    "the last in a step": ([HOLD.format(-0.01) + HOLD.format(-0.02)], [-0.02]),
+    "new": ([HOLD.format(-0.01), f"*CLOAD\n{HEAD}" + HELD.replace("RY", "RY, OP=NEW")], [-0.01, -0.2]),
+    "new twice": (
+        [HOLD.format(-0.01), HELD.replace("RY", "RY, OP=NEW") + HOLD.replace("RY", "RY, OP=NEW").format(0.02)],
+        [-0.01, 0.02],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HOLDS)
+def test_prescribed_values(folder, case):
+    """The last value of a node counts, whatever sets it is in; OP=NEW ends all values, those before the steps as well."""
+    steps, found = HOLDS[case]
+    assert heights(folder, column(*steps))[0] == pytest.approx(found, rel=1e-9)
+
+
+def test_one_node_otherwise(folder):
+    """A node of a held set that is led elsewhere: with nu = 0 a corner of the head, whose others stay."""
+    deck = read(folder, column("*BOUNDARY\nhead 1, 3, 3, -0.01\n121, 3, 3, -0.03\n"))
+    for _ in deck.run():
+        pass
+    assert [deck.displacement(node)[2] for node in (121, 122, 123, 124)] == pytest.approx([-0.03, -0.01, -0.01, -0.01])
+
+
+def test_hexahedra_bend_as_in_calculix(folder):
+    """C3D8 are integrated fully: displacements of CalculiX 2.20 for the same deck."""
+    deck = read(folder, column("*CLOAD\nhead 1, 1, 1.\n"))
+    for _ in deck.run():
+        pass
+    assert deck.displacement(123) == pytest.approx([0.1165477, -0.00996147, -0.0296958], rel=1e-5)
+
+
+def test_thickness(folder):
+    """Forces act on the thickness of plane bodies, pressures on an area; the deck says what contacts mean."""
+    text = column("*CLOAD\nhead 1, 2, -5.\n", "*CLOAD, OP=NEW\n*DLOAD\n11, P3, 10.\n", kind="CPS4", thickness="0.1\n", held=FLAT)
+    found, deck = heights(folder, text)
+    assert found == pytest.approx([-2 * 100.0 / E, -2 * 10.0 / E], rel=1e-9)
+    assert "thickness 0.1" in deck.left_out[0]
+    other = "0.1\n*SOLID SECTION, ELSET=body 1, MATERIAL=STEEL\n0.2\n"
+    refused(uem.InputError, ("0.1 and 0.2",), lambda: read(folder, column("", kind="CPS4", thickness=other, held=FLAT)))
+
+
+def test_temperatures(folder):
+    """A hexahedron has the mean temperature of its vertices, and grows without stress; OP=NEW brings others back to the start."""
+    steps = ["*TEMPERATURE\nall, 120.\n", "*TEMPERATURE, OP=NEW\nhead 1, 220.\n", "*TEMPERATURE\nhead 1, 420.\n"]
+    deck = read(folder, column(*steps, cells=1))
+    found = [deck.displacement(113) for _ in deck.run()]
+    assert np.array(found) == pytest.approx(ALPHA * np.outer([100.0, 100.0, 200.0], [1.0, 1.0, 2.0]), rel=1e-9)
+
+
+def test_what_is_said(folder):
+    """Options that are not taken, and elements that are integrated otherwise, are named."""
+    step = "*BOUNDARY, LOAD CASE=2\nhead 1, 1, 1\n*CLOAD, USER\nhead 1, 3, -1.\n"
+    deck = read(folder, column(step).replace("*STEP", "*STEP, PERTURBATION").replace("C3D8", "C3D8I"))
+    assert deck.left_out == [
+        "PERTURBATION of *STEP", "LOAD CASE of *BOUNDARY", "USER of *CLOAD", "C3D8I: complete cells, integrated fully",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("*ELASTIC", "*ELASTIC, TYPE=ORTHO", ("TYPE=ORTHO", "ISO")),
+        ("*EXPANSION", "*EXPANSION, TYPE=ORTHO", ("TYPE=ORTHO", "ISO")),
+        ("*BOUNDARY\nhead", "*BOUNDARY, FIXED\nhead", ("FIXED",)),
+        ("head 1, 3", "head 1, 0", ("degree of freedom 0", "1 to 3")),
+        ("11, P2", "11, P1", ("between two elements",)),
+        ("ELSET=body 1, MATERIAL", "ELSET=half, MATERIAL", ("element 11", "*SOLID SECTION")),
+    ],
+)
+def test_what_is_refused(folder, old, new, said):
+    """What would be taken for something else."""
+    text = column("*DLOAD\n11, P2, 1.\n*BOUNDARY\nhead 1, 3, 3\n").replace("*MATERIAL", "*ELSET, ELSET=half\n10\n*MATERIAL")
+    assert old in text
+    refused(uem.InputError, said, lambda: read(folder, text.replace(old, new)))
