@@ -104,6 +104,8 @@ class Contact(WatchedContact, given.Sealed):
             :attr:`damage`, and :attr:`pressure` and :attr:`traction` with the bonds. Friction acts on the damaged part. An
             ``Adhesion`` attracts whatever faces each other.
         leak: a ``Leak`` lets a fluid enter between the surfaces from one side, which presses on both.
+        corners: nodes at pointed convex edges of a meshed target are contactors of the contactor's facets, too, with
+            ``"node_to_surface"`` and hard contact without wear, ``adjust`` and heat. False: they may enter between contactors.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -139,6 +141,7 @@ class Contact(WatchedContact, given.Sealed):
         normal: SoftContact | None = None,
         cohesion: Cohesive | Adhesion | None = None,
         leak: Leak | None = None,
+        corners: bool = True,
         measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
     ):
@@ -154,7 +157,7 @@ class Contact(WatchedContact, given.Sealed):
                 max_penetration = given.number("max_penetration", max_penetration, BOUND)
             if thickness is not None:
                 thickness = given.number("thickness", thickness, THICKNESS)
-            chords = given.flag("chords", chords)
+            self.corners, chords = given.flag("corners", corners), given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
             self.heats = conductances_of(heat)
             self.normal = given_normal(normal, friction, wear, self.heats, tied)
@@ -227,9 +230,11 @@ class Contact(WatchedContact, given.Sealed):
         self._friction = value
 
     def _take_friction(self, law: FrictionLaw, mu: Array | None) -> None:
-        """Set a friction law with these values at the contactors ``(n,)``, None for zeros."""
+        """Set a friction law with these values at the contactors ``(n,)``, None for zeros (collective)."""
         if self.pair.frictional:
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
+        if self.at_corners is not None:
+            self.at_corners._take_friction(law, self._friction_at(law, self.at_corners.nodes, self._at))
 
     def take_load(self, at: float, known: bool = False) -> None:
         """Update friction to a load factor or a time, if it depends on these (collective).
@@ -292,6 +297,9 @@ class Contact(WatchedContact, given.Sealed):
         """Set the present offset in the pair, if an offset is or was in use (collective)."""
         if self._offsets is not None or callable(self._offset) or self._offset != 0.0:
             self._offsets_of_pair().set(self._offset)
+        if self.at_corners is not None:
+            self.at_corners._set_offset()
+            self.at_corners.pair.project()
 
     def _offsets_of_pair(self) -> Offsets:
         """Offsets of the pair's gaps, made at the first call."""
@@ -300,15 +308,6 @@ class Contact(WatchedContact, given.Sealed):
 
             self._offsets = Offsets(self.pair, self.name)
         return self._offsets
-
-    @property
-    def adjusted(self) -> float:
-        """The largest initial gap or penetration that ``adjust`` has removed, a length (collective).
-
-        Of tied contactors it is the largest gap that is kept.
-        """
-        own = self.pair.kept_gaps() if self._offsets is None else self._offsets.adjusted
-        return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
 
     def words(self) -> dict[str, str]:
         """Settings of tie and normal contact, which must be equal when a checkpoint is resumed."""
@@ -343,7 +342,7 @@ class Contact(WatchedContact, given.Sealed):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear, normal=repr(self.normal), cohesion=repr(self.cohesion), leak=repr(self.leak),
+            wear=self._wear, corners=self.corners, normal=repr(self.normal), cohesion=repr(self.cohesion), leak=repr(self.leak),
             heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")

@@ -60,7 +60,7 @@ def _kind(contact: Contact) -> Hashable:
     pair = contact.pair
     of = type(contact), type(pair), type(pair.discretisation), type(pair.target)
     nodal = of == (Contact, Interface, NodeToSurface, MeshTarget)
-    if not nodal or pair.sliding != "finite" or pair.tie is not None or pair.heats:
+    if not nodal or contact.at_corners is not None or pair.sliding != "finite" or pair.tie is not None or pair.heats:
         return None
     if pair.friction is not None and not _joins(pair.friction):
         return None

@@ -177,7 +177,11 @@ class ContactResults(HeatResults):
 
     def pressing(self) -> tuple[Array, Array]:
         """Normal ``(n_contactors,)`` and tangential forces ``(n_contactors, gdim)`` that are divided by ``measured_areas`` (collective)."""
-        return self.pair.pressing()
+        return self._with_corners(*self.pair.pressing())
+
+    def _with_corners(self, across: Array, along: Array) -> tuple[Array, Array]:
+        """The forces, with those of a second part of the contact (collective)."""
+        return across, along
 
     def leads(self) -> Bools:
         """Contactors that conduct heat when they touch; only one of two that follow each other ``(n_contactors,)`` (collective)."""
@@ -227,7 +231,8 @@ class ContactResults(HeatResults):
         if self.contactor.dim > 0:
             normal = None if self.coupling == "mortar" else self.pair.projection.normal
             areas = self._seam.evenly(self.nodes, self.surface.of_functions(self.nodes, normal, lambda shape: basis_of(shape).T))
-            f.x.array[: self.config.n_owned] = density(self.config, self.contactor, self.nodes, self.pair.pressing()[0], areas)
+            pressed, _ = self._with_corners(*self.pair.pressing())
+            f.x.array[: self.config.n_owned] = density(self.config, self.contactor, self.nodes, pressed, areas)
             f.x.scatter_forward()
         return f
 

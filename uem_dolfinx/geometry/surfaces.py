@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import ufl
+from dolfinx.mesh import exterior_facet_indices, locate_entities_boundary
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.errors import OrientationError, SurfaceError
-from uem_dolfinx.geometry.axisymmetry import circumference
+from uem_dolfinx.geometry.axisymmetry import circumference, on_axis
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of
 from uem_dolfinx.geometry.shapes import FacetShape, integrals
 from uem_dolfinx.geometry.sharp import sharp_nodes
-from uem_dolfinx.geometry.tags import Tag, locate_dofs
+from uem_dolfinx.geometry.tags import Tag, as_tag, locate_dofs
 from uem_dolfinx.parallel import Exchange, agree, reduced
 
 
@@ -26,6 +27,16 @@ def surface_nodes(config: Configuration, tag: Tag) -> Indices:
     """Owned nodes on the closure of a tag's facets, or at its points, sorted (collective)."""
     nodes = locate_dofs(config.V, tag)
     return np.unique(nodes[nodes < config.n_owned]).astype(np.int32)
+
+
+def exterior_facets(config: Configuration) -> Tag:
+    """Facets on the outside of all bodies; in axisymmetry those on the axis are inside (collective)."""
+    mesh, dim = config.mesh, config.tdim - 1
+    mesh.topology.create_connectivity(dim, config.tdim)
+    facets = np.asarray(exterior_facet_indices(mesh.topology))
+    if config.axisymmetric:
+        facets = np.setdiff1d(facets, locate_entities_boundary(mesh, dim, on_axis(mesh)))
+    return as_tag(facets, mesh, (dim,), "the outside")
 
 
 class Areas:

@@ -327,6 +327,8 @@ def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> 
     """Refuse parameters on which the problem does not depend, or by which there are no derivatives."""
     known = any(contact is m.contact for contact in problem.contacts)
     given.kind(what, m, known, "a parameter of a contact of the problem")
+    if m.contact.corners_touch():
+        raise InputError(f"{what} is of contact '{m.contact.name}', whose target's corners touch: expected corners=False")
     if m.parameter == "friction" and not m.contact.pair.frictional:
         raise InputError(
             f"{what} is the friction of contact '{m.contact.name}', which has none: expected a contact with friction"

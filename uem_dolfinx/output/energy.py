@@ -100,14 +100,15 @@ class EnergyBook(Closing, given.Sealed):
         self.momenta: list[Array] = []
         self.impulses: list[Array] = []
         axes, names = "xyz"[: problem.config.gdim], [f.name for f in fields(Energies)]
-        suffixes = contact_suffixes(problem.contacts)
+        self._contacts = [contact for contact in problem.contacts if not contact.told_by_another]
+        suffixes = contact_suffixes(self._contacts)
         columns = [*names, *(f"momentum_{a}" for a in axes), *(f"impulse_{a}{s}" for s in suffixes for a in axes)]
         resume_at = self.dynamics if resume else None
         self.table = None if path is None else CsvTable(path, problem.comm, columns, resume_at, whose="an EnergyBook")
         begin = {} if self.table is None else self.table.last
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])
         # contacts read from a checkpoint include earlier frictional dissipation
-        self._before = begin.get("friction", 0.0) - sum(c.dissipation for c in problem.contacts)
+        self._before = begin.get("friction", 0.0) - sum(c.dissipation for c in self._contacts)
         impulse = [begin.get(f"impulse_{a}{s}", 0.0) for s in suffixes for a in axes]
         self._impulse = np.reshape(impulse, (len(suffixes), len(axes)))
         if begin and begin["time"] != self.dynamics.time:
@@ -130,7 +131,7 @@ class EnergyBook(Closing, given.Sealed):
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
         u = np.array(problem.config.displacement[: problem.config.n_owned].ravel())
         self._u, self._time, self._driven = u, self.dynamics.time, self.dynamics.driven
-        contact = sum((c.force.x.array[:n] for c in problem.contacts), np.zeros(n))
+        contact = sum((c.force.x.array[:n] for c in self._contacts), np.zeros(n))
         problem.bodies.assemble()
         # the work of supports on mass, with jumps of velocity, is the change of its kinetic energy, see ``driven``
         driving = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
@@ -146,7 +147,7 @@ class EnergyBook(Closing, given.Sealed):
         self._at_points = [(one.pushed, one.places) for one in added]
         #: Forces of damping, from outside, and of contact ``(3, n)``.
         self._forces = np.stack([self._assembled(self._damping), outer, contact])
-        self._resultants = np.array([c.resultant().force for c in problem.contacts]).reshape(-1, problem.config.gdim)
+        self._resultants = np.array([c.resultant().force for c in self._contacts]).reshape(-1, problem.config.gdim)
 
     def _assembled(self, form: Any) -> Array:
         """Nodal forces of a compiled linear form at the owned components, zero without one."""
@@ -187,7 +188,7 @@ class EnergyBook(Closing, given.Sealed):
     def _append(self, energies: tuple[float, float, float]) -> Energies:
         damped, external, contact = (float(w) for w in self._works)
         defect = sum(energies) + damped - external - contact - self._first
-        friction = self._before + sum(c.dissipation for c in self.problem.contacts)
+        friction = self._before + sum(c.dissipation for c in self._contacts)
         row = Energies(self._time, *energies, damped, external, contact, friction, defect)
         self.rows.append(row)
         self.momenta.append(self.dynamics.momentum())

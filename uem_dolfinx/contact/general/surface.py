@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from dolfinx.mesh import exterior_facet_indices, locate_entities_boundary
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.errors import SurfaceError
-from uem_dolfinx.geometry.axisymmetry import on_axis
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.skin import Apart, Skin
-from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.surfaces import exterior_facets, surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag
 from uem_dolfinx.parallel import reduced
 
@@ -40,11 +38,7 @@ def touching_surface(config: Configuration, surfaces: Part | None, without: Sequ
     """The facets that may touch others (collective)."""
     mesh, facets = config.mesh, config.tdim - 1
     if surfaces is None:
-        mesh.topology.create_connectivity(facets, config.tdim)
-        surfaces = np.asarray(exterior_facet_indices(mesh.topology))
-        if config.axisymmetric:
-            # facets on the axis are inside the bodies
-            surfaces = np.setdiff1d(surfaces, locate_entities_boundary(mesh, facets, on_axis(mesh)))
+        surfaces = exterior_facets(config)
     tag = as_tag(surfaces, mesh, (facets,), "surfaces")
     left = tag.entities
     for part in without:

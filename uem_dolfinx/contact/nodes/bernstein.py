@@ -157,7 +157,7 @@ class Bernstein(NodeToSurface):
         k, gap = kinematics, kinematics.projection.gap
         usable = ~k.ends.past(state) & ~state.in_corner
         control = self.family.control_gaps(k.projection, usable)
-        plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.left)
+        plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.left, k.out)
         return ControlKinematics(*plain, control=control)
 
 

@@ -6,9 +6,10 @@ contactor.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from mpi4py import MPI
 
@@ -45,6 +46,8 @@ class NodeToSurface(OnTarget):
     ends_hold: bool | Bools = True
     #: Contactors that something else holds, so that they must not touch the target ``(n,)``, or None.
     left_out: Bools | None = None
+    #: Which contactors, by their projection, are left to other equations ``(n,)`` (collective); None: none are.
+    leaves_out: Callable[[FacetProjection], Bools] | None = None
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         self.concave_edges: ConcaveEdges | None = None
@@ -96,7 +99,8 @@ class NodeToSurface(OnTarget):
             else:
                 nearest = projection = self.on_target(points, self.anchor)
         moves = self._target_moves(projection) if self.prescribed else None
-        return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves), state)
+        out = None if self.leaves_out is None else self.leaves_out(cast("FacetProjection", nearest))
+        return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves, out=out), state)
 
     def _asks(self, state: PairState) -> bool:
         """Whether any contactor on any rank may be near the target (collective)."""
@@ -145,12 +149,14 @@ class NodalKinematics(PlacedOnTarget):
         corners: of the target that hold contactors; None if no rank has such a corner.
         target_moves: whether the target can move along the normal ``(n,)``; None if no contactor is prescribed.
         left: contactors that have just left a corner ``(n,)``, or None.
+        out: contactors that are left to other equations ``(n,)``, or None.
     """
 
     of: NodeToSurface
     corners: Corners | None
     target_moves: Bools | None
     left: Bools | None = None
+    out: Bools | None = None
 
     @cached_property
     def movable(self) -> Bools:
@@ -211,7 +217,8 @@ class NodalKinematics(PlacedOnTarget):
     @cached_property
     def ends(self) -> Ends:
         """Open ends, which can hold contactors; see ``Kinematics``."""
-        return Ends(self.projection, self.of.thickness, self.of.ends_hold, out=self.of.left_out)
+        out = self.of.left_out if self.out is None else self.out
+        return Ends(self.projection, self.of.thickness, self.of.ends_hold, out=out)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

@@ -224,6 +224,8 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
     p = pair.projection
     near = p.way_beyond < 0.5 * p.facet_size
     slipped = pair.off & ~before & near & (p.gap < 0.0)
+    if pair.kinematics.ends.out is not None:
+        slipped &= ~pair.kinematics.ends.out
     sums = np.array([areas[slipped].sum(), areas[pair.trial.active].sum(), float(slipped.sum())])
     lost, held, count = reduced(pair.config.comm, sums)
     if lost <= SLIPPED * (lost + held):

@@ -56,9 +56,9 @@ class CornerInside:
     both: bool = False
 
     def __str__(self) -> str:
-        remedy = "take coupling = 'mortar', as the contactor has corners in contact, too"
+        remedy = "take corners = True, or take coupling = 'mortar', as the contactor has corners in contact, too"
         if not self.both:
-            remedy = "swap the two, or take coupling = 'mortar'"
+            remedy = "take corners = True, swap the two, or take coupling = 'mortar'"
         return (
             f"a convex corner of the target, at {self.place}, is {self.depth:.3g} inside a facet of the contactor, "
             f"{100 * self.part:.2g} % of its size, between contactors, where no condition prevents it: {remedy}"

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.results import ContactResults
+from uem_dolfinx.contact.both_sides import OfBothSides
 from uem_dolfinx.contact.warnings.checks import sagging, warn_of_sagging_facets, warn_of_slipped
 from uem_dolfinx.errors import OrientationError, UEMError
 from uem_dolfinx.geometry.facets import facets_of
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.warnings.target_corners import CornerInside, TargetCorners
 
 
-class WatchedContact(ContactResults):
+class WatchedContact(OfBothSides):
     """A contact of a problem, with checks of ends, corners and wear after every step.
 
     Attributes:
@@ -53,6 +53,15 @@ class WatchedContact(ContactResults):
         self._pair = pair
         if self._offsets is not None:
             self._offsets.pair = pair
+
+    @property
+    def adjusted(self) -> float:
+        """The largest initial gap or penetration that ``adjust`` has removed, a length (collective).
+
+        Of tied contactors it is the largest gap that is kept.
+        """
+        own = self.pair.kept_gaps() if self._offsets is None else self._offsets.adjusted
+        return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
 
     @property
     def on(self) -> bool:

@@ -161,7 +161,11 @@ class Stage:
             # similar contacts that were joined may be switched separately
             part_contacts(problem)
         bodies, held = problem.bodies, problem.bodies.held
-        parts = [(part, on) for one, on in step.contacts.items() for part in ([one] if isinstance(one, Contact) else one.parts)]
+        parts = [
+            (part, on)
+            for one, on in step.contacts.items()
+            for part in (one.parts_with_corners if isinstance(one, Contact) else one.parts)
+        ]
         left, come = ([part for part, on in parts if on is not part.on and on is which] for which in (False, True))
         acting = reactions(problem) if fresh and problem.progress.steps else None
         if step.bcs is not None:

@@ -51,12 +51,16 @@ def touching(problem: Any) -> list[bool]:
     """Whether each contact has active contactors (collective)."""
     if not problem.contacts:
         return []
-    active = np.array([bool(contact.pair.united.any()) for contact in problem.contacts])
+    active = np.array([any(part.pair.united.any() for part in one.parts_with_corners) for one in problem.contacts])
     return list(map(bool, reduced(problem.comm, active, op=MPI.LOR)))
 
 
 def events(problem: Any, before: list[bool], after: list[bool]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the contacts that have closed, and of those that have opened, by whether each had active contactors."""
-    names = [contact.name for contact in problem.contacts]
+    told = [not contact.told_by_another for contact in problem.contacts]
+    names, before, after = (
+        [one for one, is_told in zip(ones, told) if is_told]
+        for ones in ([contact.name for contact in problem.contacts], before, after)
+    )
     touched = tuple(name for name, was, now in zip(names, before, after) if now and not was)
     return touched, tuple(name for name, was, now in zip(names, before, after) if was and not now)

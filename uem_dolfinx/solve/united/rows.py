@@ -65,7 +65,7 @@ class OverConstraints:
         self.shared = bool(found[-1])
         # bodies that follow each other in one order never follow each other mutually
         ordered = np.array([pair.discretisation.ordered_by for pair in pairs])
-        one_order = (ordered[:, None] == ordered) & (ordered[:, None] >= 0)
+        one_order = (ordered[:, None] == ordered) & (ordered[:, None] != -1)
         both_ways = meets & meets.T & ~one_order
         # surfaces that are tied as a whole are never in contact; they share only edge nodes with other surfaces
         tied = np.array([pair.tie is not None and pair.tie.whole for pair in pairs], dtype=bool)
