@@ -133,9 +133,12 @@ def test_temperatures(folder):
 def test_what_is_said(folder):
     """Options that are not taken, and elements that are integrated otherwise, are named."""
     step = "*BOUNDARY, LOAD CASE=2\nhead 1, 1, 1\n*CLOAD, USER\nhead 1, 3, -1.\n"
-    deck = read(folder, column(step).replace("*STEP", "*STEP, PERTURBATION").replace("C3D8", "C3D8I"))
+    spring = "*ELEMENT, TYPE=SPRINGA, ELSET=springs\n900, 101, 121\n*MATERIAL"
+    text = column(step).replace("*STEP", "*STEP, PERTURBATION").replace("C3D8", "C3D8I")
+    deck = read(folder, text.replace("*MATERIAL", spring))
     assert deck.left_out == [
-        "PERTURBATION of *STEP", "LOAD CASE of *BOUNDARY", "USER of *CLOAD", "C3D8I: complete cells, integrated fully",
+        "PERTURBATION of *STEP", "LOAD CASE of *BOUNDARY", "USER of *CLOAD", "1 elements of type SPRINGA: they are no part of a body",
+        "C3D8I: complete cells, integrated fully",
     ]  # fmt: skip
 
 
@@ -155,3 +158,31 @@ def test_what_is_refused(folder, old, new, said):
     text = column("*DLOAD\n11, P2, 1.\n*BOUNDARY\nhead 1, 3, 3\n").replace("*MATERIAL", "*ELSET, ELSET=half\n10\n*MATERIAL")
     assert old in text
     refused(uem.InputError, said, lambda: read(folder, text.replace(old, new)))
+
+
+def test_adjusted_by_a_set(folder):
+    """ADJUST with a set closes gaps as ADJUST with a length does, and says that it takes all contactors."""
+    gap = 1e-3
+    text = (
+        columns([(0.0, 1.0, 1), (1.0 + gap, 2.0 + gap, 1)]) + STEEL.format(0.0) + "*SOLID SECTION, ELSET=body 2, MATERIAL=STEEL\n"
+    )
+    text += "*CONTACT PAIR, INTERACTION=I, ADJUST={}, TYPE=SURFACE TO SURFACE\nunder 2, over 1\n*SURFACE INTERACTION, NAME=I\n"
+    text += "*BOUNDARY\nfoot 1, 1, 3\nfoot 2, 1, 2\nhead 2, 1, 2\n*STEP\n*STATIC\n*CLOAD\nhead 2, 3, -0.25\n*END STEP\n"
+    for given in ("0.01", "foot 2"):
+        found, deck = heights(folder, text.format(given), node=211)
+        assert found == pytest.approx([-2.0 / E], rel=1e-9)
+        assert deck.left_out == (
+            ["ADJUST=foot 2 of *CONTACT PAIR: all contactors near the surface are adjusted"] if given[0] == "f" else []
+        )
+
+
+def test_direct_steps_of_heat(folder):
+    """With DIRECT all steps of time have the given length."""
+    heat = "*CONDUCTIVITY\n1.\n*SPECIFIC HEAT\n1.\n*DENSITY\n1.\n*SOLID"
+    step = "*BOUNDARY\nhead 1, 1, 3\nfoot 1, 11, 11, 100.\n"
+    for option in ("", ", DIRECT"):
+        text = column(step).replace("*SOLID", heat).replace("*STATIC\n", f"*HEAT TRANSFER{option}\n0.05, 1.\n")
+        deck = read(folder, text)
+        taken = [float(deck._dt.value) for _ in deck.run()]
+        assert sum(taken) == pytest.approx(1.0) and (len(set(np.round(taken, 9))) == 1) is bool(option)
+        assert not option or len(taken) == 20

@@ -158,7 +158,7 @@ class Deck(given.Sealed):
             return
         time, dt = 0.0, step.first
         while time < step.duration:
-            dt = min(dt, step.duration / LEAST_STEPS)
+            dt = step.first if step.direct else min(dt, step.duration / LEAST_STEPS)
             end = time + dt if time + (1.0 + SAME_LENGTH) * dt < step.duration else step.duration
             # conditions of heat act in full from the beginning
             yield OfUsers(f"step {k + 1}", bcs=bcs, contacts=changed, loads=self._loads(k, 1.0), begin=self._pass(end - time))

@@ -68,7 +68,7 @@ class Pair:
     interaction: str = ""
     surfaces: bool = True
     small: bool = False
-    adjust: float | None = None
+    adjust: float | bool | None = None
     tied: bool = False
 
 
@@ -81,6 +81,7 @@ class Step:
     first: float = 1.0
     duration: float = 1.0
     steady: bool = False
+    direct: bool = False
     held: dict[Where, float] = field(default_factory=dict)
     forces: dict[Where, float] = field(default_factory=dict)
     pressures: dict[Where, float] = field(default_factory=dict)
@@ -146,7 +147,7 @@ class _Reader:
             times = [*_numbers(rows[0] if rows else []), 0.0, 0.0]
             duration = times[1] or 1.0
             self._step.kind, self._step.first, self._step.duration = keyword, times[0] or duration, duration
-            self._step.steady = "STEADY STATE" in options
+            self._step.steady, self._step.direct = "STEADY STATE" in options, "DIRECT" in options
             self.model.steps.append(self._step)
             return True
         reader = self._readers.get(keyword)
@@ -196,12 +197,15 @@ class _Reader:
     # -- the model -------------------------------------------------------------------------------------------------------
 
     def _pair(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        adjust = options.get("ADJUST")
+        adjust: Any = options.get("ADJUST") or None
+        if adjust is not None and adjust[0] not in ".0123456789":
+            self.model.left_out.append(f"ADJUST={adjust} of *CONTACT PAIR: all contactors near the surface are adjusted")
+            adjust = True
         for slave, master in (row[:2] for row in rows):
             self.model.pairs.append(
                 Pair(
                     slave, master, options["INTERACTION"].upper(), not options.get("TYPE", "NODE").upper().startswith("NODE"),
-                    "SMALL SLIDING" in options, float(adjust) if adjust and adjust[0] in ".0123456789" else None,
+                    "SMALL SLIDING" in options, float(adjust) if isinstance(adjust, str) else adjust,
                 )
             )  # fmt: skip
 
@@ -318,7 +322,8 @@ class _Reader:
         """Let values at single nodes and sides be those of sets, and check that elements have materials."""
         steps, deck = self.model.steps, self._deck
         known = [deck.elsets[name][1] for name, _ in self.model.sections if name in deck.elsets]
-        if len(known) == len(self.model.sections) and (bare := set(deck.elements).difference(*known)):
+        bodies = all(name.startswith(("C3D", "CP", "CAX")) for name in self.model.types)
+        if bodies and len(known) == len(self.model.sections) and (bare := set(deck.elements).difference(*known)):
             raise InputError(f"element {min(bare)} has no *SOLID SECTION: expected a material of all elements")
         held, forces, pressures = ([getattr(step, what) for step in steps] for what in ("held", "forces", "pressures"))
         for step in steps:
@@ -420,6 +425,7 @@ def model_of(deck: Deck) -> Model:
         unknown = [name for name in options if name and name.replace(" ", "_") not in OPTIONS.get(keyword, "").split()]
         grow = ": values grow in proportion to the time of the step"
         left_out += [f"{name} of *{keyword}{grow if name == 'AMPLITUDE' else ''}" for name in unknown]
+    left_out += [f"{n} elements of type {name}: they are no part of a body" for name, n in deck.left_out.items()]
     left_out += [f"{name}: complete cells, integrated fully" for name in sorted(deck.types) if re.search(OTHERWISE, name)]
     if reader.model.thickness != 1.0:
         left_out.append(f"thickness {reader.model.thickness}: forces of contacts and sections are those of a thickness of 1")
