@@ -82,6 +82,7 @@ HOLDS = {
     "anew by a set": (["*BOUNDARY\n" + EACH.format("3, -0.03"), HOLD.format(-0.01)], [-0.03, -0.01]),
     "the last in a step": ([HOLD.format(-0.01) + HOLD.format(-0.02)], [-0.02]),
     "new": ([HOLD.format(-0.01), f"*CLOAD\n{HEAD}" + HELD.replace("RY", "RY, OP=NEW")], [-0.01, -0.2]),
+    "by name": (["*BOUNDARY\nhead 1, XSYMM\nhead 1, 3, 3, -0.02\n"], [-0.02]),
     "new twice": (
         [HOLD.format(-0.01), HELD.replace("RY", "RY, OP=NEW") + HOLD.replace("RY", "RY, OP=NEW").format(0.02)],
         [-0.01, 0.02],
@@ -150,14 +151,21 @@ def test_what_is_said(folder):
         ("*BOUNDARY\nhead", "*BOUNDARY, FIXED\nhead", ("FIXED",)),
         ("head 1, 3", "head 1, 0", ("degree of freedom 0", "1 to 3")),
         ("11, P2", "11, P1", ("between two elements",)),
+        ("head 1, 3", "empty, 3", ("'empty'", "no nodes")),
+        ("MATERIAL=STEEL", "MATERIAL=IRON", ("'IRON'", "STEEL")),
+        ("ELSET=body 1, MATERIAL", "ELSET=body 3, MATERIAL", ("'BODY 3'",)),
+        ("*BOUNDARY", "*SOLID SECTION, ELSET=half, MATERIAL=STEEL\n*BOUNDARY", ("element 10", "two sections")),
+        ("*BOUNDARY", "*EQUATION\n2\n121, 5, 1., 122, 5, -1.\n*BOUNDARY", ("'5'", "1 to 3")),
         ("ELSET=body 1, MATERIAL", "ELSET=half, MATERIAL", ("element 11", "*SOLID SECTION")),
     ],
 )
 def test_what_is_refused(folder, old, new, said):
     """What would be taken for something else."""
-    text = column("*DLOAD\n11, P2, 1.\n*BOUNDARY\nhead 1, 3, 3\n").replace("*MATERIAL", "*ELSET, ELSET=half\n10\n*MATERIAL")
+    text = column("*DLOAD\n11, P2, 1.\n*BOUNDARY\nhead 1, 3, 3\n").replace(
+        "*MATERIAL", "*NSET, NSET=empty\n*ELSET, ELSET=half\n10\n*MATERIAL"
+    )
     assert old in text
-    refused(uem.InputError, said, lambda: read(folder, text.replace(old, new)))
+    refused(uem.InputError, said, lambda: read(folder, text.replace(old, new, 1)))
 
 
 def test_adjusted_by_a_set(folder):

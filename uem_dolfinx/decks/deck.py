@@ -24,7 +24,8 @@ from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.laws.exponential import Exponential
 from uem_dolfinx.contact.laws.soft import SoftContact
 from uem_dolfinx.contact.preload import Preload
-from uem_dolfinx.decks.model import TEMPERATURE, Interaction, Model, Pair, Step, model_of
+from uem_dolfinx.decks.model import model_of
+from uem_dolfinx.decks.parts import TEMPERATURE, Interaction, Model, Pair, Step
 from uem_dolfinx.errors import InputError, MissingFileError, SpaceError, TagError
 from uem_dolfinx.geometry.axisymmetry import axisymmetric
 from uem_dolfinx.geometry.cuts import BACK, cut

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from uem_dolfinx.decks.parts import KINDS, TEMPERATURE, Interaction, Material, Model, Pair, Step, Where
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.decks import Deck
 
@@ -15,10 +16,10 @@ OUTPUT = (
     "HEADING", "NODE PRINT", "EL PRINT", "NODE FILE", "EL FILE", "NODE OUTPUT", "ELEMENT OUTPUT", "CONTACT PRINT", "CONTACT FILE",
     "CONTACT OUTPUT", "OUTPUT", "RESTART", "CONTROLS", "END STEP", "PREPRINT", "SECTION PRINT", "FILE FORMAT", "ENERGY PRINT",
 )  # fmt: skip
-#: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
-KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True}
 #: Element types that lack nodes in the middle of faces and cells, or are integrated with fewer points or with incompatible modes.
 OTHERWISE = r"\d[RI]|C3D20|C(PS|PE|AX)8"
+#: Names of Abaqus for degrees of freedom that are held, from the first to the last.
+HOLDS = {"ENCASTRE": ("1", "6"), "PINNED": ("1", "3"), "XSYMM": ("1", "1"), "YSYMM": ("2", "2"), "ZSYMM": ("3", "3")}
 #: Options that are taken, or that change nothing here; all others are left out.
 OPTIONS = {
     "ELASTIC": "TYPE", "EXPANSION": "TYPE ZERO", "SOLID SECTION": "ELSET MATERIAL ORIENTATION OFFSET", "MATERIAL": "NAME",
@@ -28,96 +29,8 @@ OPTIONS = {
     "MODEL CHANGE": "TYPE ADD REMOVE", "STATIC": "SOLVER DIRECT", "HEAT TRANSFER": "SOLVER DIRECT STEADY_STATE",
     "COUPLED TEMPERATURE-DISPLACEMENT": "SOLVER DIRECT STEADY_STATE",
 }  # fmt: skip
-#: Number of the temperature among the degrees of freedom.
-#: [format; number; -]
-TEMPERATURE = 11
-
-#: A set or a node, by name, and a degree of freedom, or the label of a load.
-Where: TypeAlias = tuple[str, Any]
 #: Values at single nodes, or sides of elements, in turn with the same of a step.
 Acting: TypeAlias = dict[tuple[Any, Any], float]
-
-
-@dataclass
-class Material:
-    """Numbers of a material; None are not given."""
-
-    elastic: tuple[float, float] | None = None
-    density: float = 0.0
-    expansion: float = 0.0
-    conductivity: float | None = None
-    heat_capacity: float = 0.0
-
-
-@dataclass
-class Interaction:
-    """A surface interaction: its law of pressure with its numbers, friction and conductance."""
-
-    overclosure: str = "HARD"
-    numbers: list[list[float]] = field(default_factory=list)
-    friction: float = 0.0
-    conductance: list[list[float]] = field(default_factory=list)
-
-
-@dataclass
-class Pair:
-    """A contact pair or a tie."""
-
-    slave: str
-    master: str
-    interaction: str = ""
-    surfaces: bool = True
-    small: bool = False
-    adjust: float | bool | None = None
-    tied: bool = False
-
-
-@dataclass
-class Step:
-    """A step: its kind, times, and all conditions and loads that act in it, with their values at its end."""
-
-    kind: str = "STATIC"
-    nlgeom: bool = False
-    first: float = 1.0
-    duration: float = 1.0
-    steady: bool = False
-    direct: bool = False
-    held: dict[Where, float] = field(default_factory=dict)
-    forces: dict[Where, float] = field(default_factory=dict)
-    pressures: dict[Where, float] = field(default_factory=dict)
-    temperatures: dict[str, float] = field(default_factory=dict)
-    contacts: dict[tuple[str, str], bool] = field(default_factory=dict)
-
-
-@dataclass
-class Model:
-    """All of a deck but its mesh; names of sets are in capitals.
-
-    Attributes:
-        sections: set of elements and material of each section.
-        thickness: of plane bodies.
-        equations: lists of node, degree of freedom and coefficient.
-        initial: temperatures at the start, by set or node.
-        pretension: surface, reference node and axis of each section of a bolt.
-        left_out: what has no counterpart here, or is read otherwise than it stands.
-    """
-
-    types: set[str] = field(default_factory=set)
-    materials: dict[str, Material] = field(default_factory=dict)
-    interactions: dict[str, Interaction] = field(default_factory=dict)
-    sections: list[tuple[str, str]] = field(default_factory=list)
-    thickness: float = 1.0
-    pairs: list[Pair] = field(default_factory=list)
-    equations: list[list[tuple[str, int, float]]] = field(default_factory=list)
-    initial: dict[str, float] = field(default_factory=dict)
-    pretension: list[tuple[str, str, list[float]]] = field(default_factory=list)
-    steps: list[Step] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-
-    @property
-    def thermal(self) -> bool:
-        """Whether temperatures are unknown."""
-        return any(KINDS[step.kind] for step in self.steps)
 
 
 class _Reader:
@@ -221,6 +134,8 @@ class _Reader:
         while left:
             n, left = int(left[0]), left[1:]
             terms = [left[3 * k : 3 * k + 3] for k in range(n)]
+            if any(not 1 <= int(dof) <= self._dim for _, dof, _ in terms):
+                raise InputError(f"terms {terms}: expected degrees of freedom 1 to {self._dim}")
             self.model.equations.append([(self._node(node), int(dof), float(c)) for node, dof, c in terms])
             left = left[3 * n :]
 
@@ -270,6 +185,7 @@ class _Reader:
         self._begins("BOUNDARY", self._step.held, options)
         for row in rows:
             where, first, last, value = [*row, "", ""][:4]
+            first, last = HOLDS.get(first.upper(), (first, last))
             for dof in range(int(first), int(last or first) + 1):
                 if self._has(dof, _numbers([value])[0], "BOUNDARY"):
                     self._sets[where, dof] = None
@@ -314,16 +230,28 @@ class _Reader:
 
     def _nodes(self, where: str) -> list[Any]:
         """Nodes of a set or a node by their numbers, or the name of a set that there is not."""
-        return [int(where)] if where.isdigit() else self._deck.nsets.get(where.upper(), ("", [where]))[1]
+        found: list[Any] = [int(where)] if where.isdigit() else self._deck.nsets.get(where.upper(), ("", [where]))[1]
+        if not found:
+            raise InputError(f"the set '{where}' has no nodes: expected one node or more")
+        return found
 
     # -- after all keywords ----------------------------------------------------------------------------------------------
 
     def close(self) -> None:
         """Let values at single nodes and sides be those of sets, and check that elements have materials."""
         steps, deck = self.model.steps, self._deck
-        known = [deck.elsets[name][1] for name, _ in self.model.sections if name in deck.elsets]
+        for elements, name in self.model.sections:
+            if name not in self.model.materials:
+                raise InputError(
+                    f"there is no material '{name}': expected one of {', '.join(self.model.materials) or 'the deck'}"
+                )
+            if elements not in deck.elsets:
+                raise InputError(f"there is no set of elements '{elements}', which a *SOLID SECTION holds")
+        count = Counter(one for elements, _ in self.model.sections for one in set(deck.elsets[elements][1]))
+        if twice := [one for one, n in count.items() if n > 1]:
+            raise InputError(f"element {min(twice)} has two sections: expected one")
         bodies = all(name.startswith(("C3D", "CP", "CAX")) for name in self.model.types)
-        if bodies and len(known) == len(self.model.sections) and (bare := set(deck.elements).difference(*known)):
+        if bodies and (bare := set(deck.elements).difference(count)):
             raise InputError(f"element {min(bare)} has no *SOLID SECTION: expected a material of all elements")
         held, forces, pressures = ([getattr(step, what) for step in steps] for what in ("held", "forces", "pressures"))
         for step in steps:
