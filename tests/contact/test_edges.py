@@ -76,7 +76,7 @@ def test_oblique(angle):
 )
 def test_roofs(cell, degree):
     """Ridge over ridge: no force sideways at a node and between nodes, little where a piece of a ridge tilts between them."""
-    for shift, most in (((0.0, 0.0), 1e-3), ((0.25, 0.25), 4e-3), ((0.1, 0.15), 0.02)):
+    for shift, most in (((0.0, 0.0), 1e-3), ((0.25, 0.25), 4e-3), ((0.1, 0.15), 0.03)):
         r = roofs(cell, shift, degree=degree)
         run(r.problem)
         assert r.n_crossings == 1 and r.force[2] < 0.0 and side(r.force) < most
@@ -259,11 +259,10 @@ def dragged(steps, first=None):
 
 def test_from_piece_to_piece():
     """A crossing that slides on to the next nodes keeps its friction: force and dissipation know nothing of steps or order."""
-    fine = dragged(12)
-    for r in (dragged(6), dragged(12, first=1), dragged(12, first=0)):
+    fine, swapped, coarse = dragged(6, first=0), dragged(6, first=1), dragged(4)
+    for r in (swapped, coarse):
         assert np.abs(r.force - fine.force).max() < 1e-7
-    one, other = (dragged(12, first=k).edges[0].dissipation for k in (0, 1))
-    assert one == pytest.approx(other, rel=1e-8)
+    assert fine.edges[0].dissipation == pytest.approx(swapped.edges[0].dissipation, rel=1e-8)
 
 
 @pytest.mark.parametrize("angle", [0.25 * np.pi, slow(0.3), slow(1.0)])
