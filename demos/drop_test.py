@@ -99,11 +99,11 @@ if writer is not None:
 
 # %% [markdown]
 # ## The figures
-# The momentum of all nodes against the impulse of the floor, the energy balance, and the cost of a step over that of its residual.
+# The momentum of all nodes in the last step against the impulses of the floor, the energy balance, and the cost of a step over that of its residual.
 
 # %%
 m = mass.of_nodes
-momentum = comm.allreduce((m * dynamics.velocity.x.array[own].reshape(-1, 3)).sum(axis=0))
+momentum = comm.allreduce((m * dynamics.mean_velocity.x.array[own].reshape(-1, 3)).sum(axis=0))
 total = comm.allreduce(float(m[:, 0].sum()))
 start = time.perf_counter()
 for _ in range(5):
