@@ -27,7 +27,7 @@ ROOMS = [
 FLOORS = {
     "uem_dolfinx.contact": [
         "laws", "seam", "nodes", "mortar", "edges", "friction", "ties", "thermal", "pair", "offsets", "heat_results", "results",
-        "warnings", "", "general",
+        "both_sides", "warnings", "", "general",
     ],
     "uem_dolfinx.solve": ["bodies", "rigid", "slots", "united", "", "steps"],
 }  # fmt: skip
