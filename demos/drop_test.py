@@ -99,7 +99,8 @@ if writer is not None:
 
 # %% [markdown]
 # ## The figures
-# The momentum of all nodes in the last step against the impulses of the floor, the energy balance, and the cost of a step over that of its residual.
+# The momentum of all nodes in the last step against the impulses of the floor, the energy balance, and the cost of a step over that of its
+# residual.
 
 # %%
 m = mass.of_nodes

@@ -125,7 +125,7 @@ def test_linear_bodies_in_small_sliding(comm, sliding):
     """K once for all load steps, and one factorisation while the active set and the feet stay; no search after a step's first."""
     b = blocks(comm, "quadrilateral")
     problem = uem.UnitedProblem(
-        linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low, sliding=sliding, corners=False)]
+        linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low, sliding=sliding)]
     )
     with counted() as calls:
         steps = run(problem, 4)
@@ -283,9 +283,7 @@ def test_surface_that_no_corner_comes_near(comm, monkeypatch):
     made = calls_of(monkeypatch, TargetFacets, "__init__")
     for overhang in (0.0, 0.5):
         b = blocks(comm, "quadrilateral", overhang=overhang)
-        problem = uem.UnitedProblem(
-            linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low, corners=False)]
-        )
+        problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
         run(problem)
     assert [tag.name for _, _, tag, *_ in made] == ["low", "low"]
 

@@ -137,9 +137,11 @@ def test_edges_that_lie_on_edges_follow_as_before(cell, n, overhang):
     assert n_active == as_many and np.allclose(u, v, rtol=1e-9, atol=1e-12) and np.allclose(force, other, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("how", [{"coupling": "mortar"}, {"tied": True}, {"adjust": True}, {"wear": 1e-3}, {"corners": False}])
-def test_contacts_without_a_second_part(how):
-    (problem, contact, _), _ = punch(**({"corners": True} | how))
+@pytest.mark.parametrize("how", [{"coupling": "mortar"}, {"tied": True}, {"adjust": True}, {"wear": 1e-3}])
+def test_contacts_that_cannot_have_a_second_part(how):
+    with pytest.raises(uem.InputError, match="corners = True goes with hard"):
+        punch(corners=True, **how)
+    (problem, contact, _), _ = punch(**how)
     assert contact.at_corners is None and problem.contacts == [contact]
 
 

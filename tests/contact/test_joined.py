@@ -60,7 +60,7 @@ def blocks_in_a_grid(cell, counts, mu, settlement, normals="facet"):
         for j, q in enumerate(places):
             if sum(abs(x - y) for x, y in zip(p, q)) == 1 and (sum(p) % 2, i) > (sum(q) % 2, j):
                 how = {"friction": mu * (1 + i), "normals": normals}
-                contacts.append(uem.Contact(sides[i], sides[j], name=f"{i} on {j}", corners=False, **how))
+                contacts.append(uem.Contact(sides[i], sides[j], name=f"{i} on {j}", **how))
     u = fem.Function(b.V)
     F = linear(u, modulus(b.s, *[1.0 + k for k in range(len(places))]))
     bcs = oedometer(b, places, counts, settlement)
@@ -124,9 +124,7 @@ def stacks(n, gap=0.0, mu=0.0, **how):
     for k in range(n):
         bcs += clamp(b.V, b.side(2 * k, 1, 0.0)) + clamp(b.V, b.side(2 * k + 1, 1, 2.0 + gap), value=(0.01, -0.02 - gap))
     pairs = [(b.side(2 * k + 1, 1, 1.0 + gap), b.side(2 * k, 1, 1.0)) for k in range(n)]
-    contacts = [
-        uem.Contact(high, low, name=f"stack {k}", friction=mu, corners=False, **how) for k, (high, low) in enumerate(pairs)
-    ]
+    contacts = [uem.Contact(high, low, name=f"stack {k}", friction=mu, **how) for k, (high, low) in enumerate(pairs)]
     F = linear(u, modulus(b.s, *[1.0] * (2 * n)))
     return contacts, uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts, rtol=1e-11)
 
@@ -195,10 +193,7 @@ def test_a_message_names_the_contact(caplog):
     with pytest.raises(uem.PenetrationError, match="stack 1"):
         contacts, problem = stacks(2, gap=-0.05, max_penetration=0.06)
         contacts, problem = stacks(2, gap=-0.05, max_penetration=0.06)
-        refused = [
-            uem.Contact(c.contactor, c.target, name=c.name, max_penetration=m, corners=False)
-            for c, m in zip(contacts, (0.06, 0.01))
-        ]
+        refused = [uem.Contact(c.contactor, c.target, name=c.name, max_penetration=m) for c, m in zip(contacts, (0.06, 0.01))]
         uem.UnitedProblem(problem.bodies.F, problem.u, bcs=problem.bodies.bcs, contacts=refused)
     if COMM.rank == 0:
         assert "stack 0: 3 contactors start up to 0.05 inside" in caplog.text

@@ -164,7 +164,7 @@ def test_off_the_end_and_back(cell, normals):
 def test_an_end_holds_what_was_drawn_there(way, held, degree):
     """Edges that coincide slide past each other by 0.06 of a facet and hold on, with forces in balance; by 0.4 of it they let go."""
     b = blocks(COMM, "quadrilateral", 2, 2, degree=degree)
-    contact = uem.Contact(b.high, b.low, corners=False)
+    contact = uem.Contact(b.high, b.low)
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, 0, value=way), *clamp(b.V, b.top, 1, value=-0.01)]
     run(uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[contact]), 4)
     lawful(contact)

@@ -80,7 +80,7 @@ def test_sliding_off_the_end(normals):
     s, V, u, (bottom, low, high, top) = sliding_block("triangle", 0.0, normals, start=0.9, offset=0.0)
     path = fem.Function(V)
     dofs = fem.locate_dofs_topological(V, 1, top.entities)
-    contact = uem.Contact(high, low, normals=normals, corners=False)
+    contact = uem.Contact(high, low, normals=normals)
 
     def load(factor):
         path.x.array.reshape(-1, 2)[:] = [0.8 * factor, -0.01]
@@ -112,7 +112,7 @@ def test_contactor_exactly_on_a_vertex(cell, normals):
         return y
 
     b = blocks(COMM, cell, 2, 2, pose=roof)
-    contact = uem.Contact(b.high, b.low, normals=normals, max_penetration=0.1, corners=False)
+    contact = uem.Contact(b.high, b.low, normals=normals, max_penetration=0.1)
     slide = [0.0] * (b.gdim - 1) + [-0.02]
     problem = uem.UnitedProblem(
         st_venant(b.u, modulus(b.scene, 1.0, 1.0)),

@@ -174,7 +174,7 @@ def bulging(n, overhang=0.0):
 def slipping(n, part):
     """A block whose bottom is as wide as its target, pulled beside the target's end by a part of a facet."""
     b = blocks(COMM, "quadrilateral", n, n)
-    contact = uem.Contact(b.high, b.low, corners=False)
+    contact = uem.Contact(b.high, b.low)
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=(part / n, -1e-3))]
     run(uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1000.0)), b.u, bcs=bcs, contacts=[contact]))
     return contact

@@ -337,7 +337,7 @@ def test_momentum_is_kept_to_rounding():
     V = compat.function_space(s.mesh, 1, (2,))
     u, w, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
     velocity.x.array.reshape(-1, 2)[np.unique(compat.cell_dofs(V)[s.body == 1])] = -0.2, -1.0
-    contact = uem.Contact(s.tag("tip", 1, at(1, 1.02)), s.tag("top", 0, at(1, 1.0)), corners=False)
+    contact = uem.Contact(s.tag("tip", 1, at(1, 1.02)), s.tag("top", 0, at(1, 1.0)))
     dynamics = uem.Dynamics(uem.consistent_mass(V, 1.0), velocity=velocity)
     law = uem.LinearElastic(100.0, 0.3, kind="plane_strain")
     problem = uem.UnitedProblem(law.residual(u, w) * ufl.dx, u, contacts=[contact], dynamics=dynamics)

@@ -45,7 +45,7 @@ def scene(kind, displacement=0, comm=COMM):
 
     def solve():
         f.w.x.array[:] = 0.0
-        contact = uem.Contact(b.high, b.low, coupling=coupling, offset=offset[0], corners=False)
+        contact = uem.Contact(b.high, b.low, coupling=coupling, offset=offset[0])
         problem = uem.UnitedProblem(F, f.w, displacement=displacement, bcs=bcs, contacts=[contact], rtol=1e-13)
         run(problem)
         return problem

@@ -33,9 +33,7 @@ def made(E=100.0, rho=1.0, friction=0.1, scheme=None, coupling="node_to_surface"
         given, E = E, fem.Function(compat.function_space(b.scene.mesh, ("DG", 0)))
         E.x.array[:] = given
     v = ufl.TestFunction(b.V)
-    contact = uem.Contact(
-        b.high, b.low, name="pair", friction=friction, coupling=coupling, sliding=how.pop("sliding", "finite"), corners=False
-    )
+    contact = uem.Contact(b.high, b.low, name="pair", friction=friction, coupling=coupling, sliding=how.pop("sliding", "finite"))
     materials = []
     if as_what == "plastic":
         materials = [uem.VonMises(b.u, 100.0, 0.3, E, kind="plane_strain")]

@@ -208,7 +208,7 @@ def keel(
     u, driver = fem.Function(V), fem.Function(V)
     bottom, surface = s.tag("bottom", 0, at(2, -1.0)), s.tag("groove", 0, at(2, 0.0))
     edge, top = s.tag("keel", 1, at(2, 0.0)), s.tag("top", 1, at(2, 1.0))
-    contact = uem.Contact(edge, surface, friction=mu, coupling=coupling, corners=False)
+    contact = uem.Contact(edge, surface, friction=mu, coupling=coupling)
     bcs = [
         *clamp(V, bottom),
         *clamp(V, surface),

@@ -23,9 +23,7 @@ def pressed(cell, gap, way, rigid=False, degree=1, **how):
     b = blocks(COMM, cell, 2, 4, gap=gap, degree=degree)
     target = uem.RigidPlane(np.zeros(b.gdim), np.eye(b.gdim)[-1]) if rigid else b.low
     F = linear(b.u, modulus(b.scene, 1.0, 1.0))
-    return b, uem.UnitedProblem(
-        F, b.u, bcs=b.oedometer(way), contacts=[uem.Contact(b.high, target, corners=False)], rtol=1e-11, **how
-    )
+    return b, uem.UnitedProblem(F, b.u, bcs=b.oedometer(way), contacts=[uem.Contact(b.high, target)], rtol=1e-11, **how)
 
 
 def far(problem):
@@ -118,7 +116,7 @@ def test_a_fall_onto_what_is_far_away(monkeypatch):
         falling, below = tag("falling", 1, at(1, 10.0)), tag("below", 0, at(1, 0.0))
         side, beside = tag("side", 1, at(0, 0.9)), tag("beside", 2, at(0, 4.0))
         bcs = [bc for body, y in ((0, -1.0), (2, 4.0)) for c in range(2) for bc in clamp(f.V, tag("foot", body, at(1, y)), c)]
-        problem = f.problem(bcs, [uem.Contact(falling, below, corners=False), uem.Contact(side, beside, corners=False)])
+        problem = f.problem(bcs, [uem.Contact(falling, below), uem.Contact(side, beside)])
         (step,) = run(problem)
         found.append((f.moved(), step.newton_iterations))
         assert problem.contacts[0].resultant().force[1] == pytest.approx(0.8e-3, rel=1e-9)

@@ -66,7 +66,7 @@ def plate_and_block(
     if contactor == "block":
         contact = uem.Contact(s.tag("block", 1, at(g - 1, gap)), boundary(s, 0, plate))
     else:
-        contact = uem.Contact(s.tag("plate", 0, at(g - 1, 0.0)), boundary(s, 1, block, "block"), corners=False)
+        contact = uem.Contact(s.tag("plate", 0, at(g - 1, 0.0)), boundary(s, 1, block, "block"))
     ends = [s.tag("end", 0, at(0, x)) for x in (-1.0, 1.0)]
     bcs = clamp(V, s.tag("top", 1, at(g - 1, gap + 0.3)), value=[push[0], *[0.0] * (g - 2), push[1]])
     for end in ends:

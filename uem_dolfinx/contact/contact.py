@@ -104,7 +104,7 @@ class Contact(WatchedContact, given.Sealed):
             :attr:`damage`, and :attr:`pressure` and :attr:`traction` with the bonds. Friction acts on the damaged part. An
             ``Adhesion`` attracts whatever faces each other.
         leak: a ``Leak`` lets a fluid enter between the surfaces from one side, which presses on both.
-        corners: nodes at pointed convex edges of a meshed target are contactors of the contactor's facets, too, with
+        corners: True makes nodes at pointed convex edges of a meshed target contactors of the contactor's facets, too, with
             ``"node_to_surface"`` and hard contact without wear, ``adjust`` and heat. False: they may enter between contactors.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
@@ -141,7 +141,7 @@ class Contact(WatchedContact, given.Sealed):
         normal: SoftContact | None = None,
         cohesion: Cohesive | Adhesion | None = None,
         leak: Leak | None = None,
-        corners: bool = True,
+        corners: bool = False,
         measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
     ):

@@ -15,8 +15,7 @@ from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.seam.ends import END_HOLDS
-from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
-from uem_dolfinx.errors import OrientationError
+from uem_dolfinx.errors import InputError, OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.pointed import AT_CORNER, AlongEdges, AtEdges, PointedFacets, pointed_sides, sizes_at
 from uem_dolfinx.geometry.projection import Target
@@ -76,22 +75,19 @@ class CornerContact(Contact):
         """None, since the contact itself looks at them."""
 
 
-def attach(contacts: Sequence[Contact], config: Configuration, free: Bools, *, corners: bool, **clock: Any) -> list[Contact]:
-    """Attach contacts, see ``Contact.attach``, and second parts of those whose targets have pointed edges if ``corners`` (collective).
-
-    Returns:
-        The contacts, followed by all second parts.
+def with_corners(contacts: Sequence[Contact], config: Configuration, free: Bools, clock: dict[str, Any]) -> list[Contact]:
+    """Attached contacts, followed by the second parts of those with ``corners`` whose targets have pointed edges (collective).
 
     Raises:
-        ConflictError: see ``refuse_shared_pressures``.
+        InputError: for a contact with ``corners`` that cannot have a second part.
     """
     for contact in contacts:
-        # a problem that failed during set-up may have left one
-        contact.at_corners = None
-        contact.attach(config, free, **clock)
-    refuse_shared_pressures(config, contacts)
-    for contact in contacts:
-        contact.at_corners = _part_of(contact, config, free, clock) if corners and _takes_corners(contact) else None
+        if contact.corners and not _takes_corners(contact):
+            raise InputError(
+                f"contact '{contact.name}': corners = True goes with hard node-to-surface contact of two meshes, without tied, adjust, "
+                "wear, heat, cohesion, leak and friction by area or temperature: leave corners out, or these"
+            )
+        contact.at_corners = _part_of(contact, config, free, clock) if contact.corners else None
     return [*contacts, *(contact.at_corners for contact in contacts if contact.at_corners is not None)]
 
 
@@ -103,7 +99,7 @@ def _takes_corners(contact: Contact) -> bool:
     )
     nodal = isinstance(contact.pair.discretisation, NodeToSurface) and contact.coupling == "node_to_surface"
     meshed = isinstance(contact.pair.target, MeshTarget) and contact.contactor.dim == contact.config.tdim - 1
-    return contact.corners and plain and nodal and meshed and not (law.per_area or isinstance(law.field, OfTemperature))
+    return plain and nodal and meshed and not (law.per_area or isinstance(law.field, OfTemperature))
 
 
 def _part_of(contact: Contact, config: Configuration, free: Bools, clock: dict[str, Any]) -> CornerContact | None:

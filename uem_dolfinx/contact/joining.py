@@ -1,17 +1,32 @@
-"""Joint treatment of contacts of a problem that differ only in surfaces and values."""
+"""Set-up of the contacts of a problem, and joint treatment of those that differ only in surfaces and values."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from uem_dolfinx.arrays import Bools
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
+from uem_dolfinx.geometry.configuration import Configuration
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
+
+
+def attached(contacts: Sequence[Contact], config: Configuration, free: Bools, clock: dict[str, Any]) -> list[Contact]:
+    """Attach contacts, see ``Contact.attach``; returns these, followed by the second parts of contacts with corners (collective)."""
+    for contact in contacts:
+        contact.attach(config, free, **clock)
+    refuse_shared_pressures(config, contacts)
+    if not any(contact.corners for contact in contacts):
+        return list(contacts)
+    from uem_dolfinx.contact.corner_contact import with_corners
+
+    return with_corners(contacts, config, free, clock)
 
 
 def join_alike(contacts: Sequence[Contact]) -> None:

@@ -12,13 +12,11 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.compiled import with_options
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.corner_contact import attach
 from uem_dolfinx.contact.general.general import GeneralContact, parts_of
-from uem_dolfinx.contact.joining import join_alike
+from uem_dolfinx.contact.joining import attached, join_alike
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.warnings.checks import check_moved, check_new
 from uem_dolfinx.contact.warnings.watch import Watch
-from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError, UEMError
 from uem_dolfinx.form_checks import check_bilinear
 from uem_dolfinx.forms import in_all_cells
@@ -205,7 +203,7 @@ class UnitedProblem(given.Sealed):
         free = self.bodies.free[: self.config.n_owned]
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
         self.config.equations = equations
-        self.contacts = attach(self.contacts, self.config, free, corners=not is_explicit(dynamics), **clock)
+        self.contacts = attached(self.contacts, self.config, free, clock)
         if method is BodySystem:
             join_alike(self.contacts)
         if dynamics is not None:
