@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed
 
 
-class Link(given.Sealed):
+class Link(given.Sealed, ABC):
     """Common part of joints and springs: two rigid couplings, or one and the ground."""
 
     def __init__(self, a: RigidCoupling | None, b: RigidCoupling | None):
@@ -87,6 +88,7 @@ class Link(given.Sealed):
             if one is not None
         ]
 
+    @abstractmethod
     def stored(self, at: dict[int, Placement], z: Array | None) -> tuple[float, Array, Array, Array]:
         """Energy, its slope ``(12,)`` and its material and geometric second derivatives ``(12, 12)``.
 
@@ -94,7 +96,6 @@ class Link(given.Sealed):
             at: placements by id of their coupling; the reference with small rotations.
             z: small motions from there ``(12,)``; None with large rotations.
         """
-        raise NotImplementedError
 
     def places(self) -> dict[int, Placement]:
         """Present placements by id of their coupling; the reference with small rotations (collective)."""
@@ -166,8 +167,9 @@ class Joint(Link):
         shifts = [projected(a, b, v, v, self._at) for v in self._shifts]
         return shifts + [projected(a, b, v, w, None) for v, w in self._turns]
 
+    @abstractmethod
     def _coordinate(self, at: dict[int, Placement]) -> Scalar:
-        raise NotImplementedError
+        """The coordinate that is free."""
 
     def stored(self, at: dict[int, Placement], z: Array | None) -> tuple[float, Array, Array, Array]:
         """See ``Link``."""

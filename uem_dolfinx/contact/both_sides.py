@@ -1,4 +1,4 @@
-"""Results of a contact with a second part, whose contactors are nodes at corners of the target: told together."""
+"""Results of a contact with a second part, whose contactors are nodes at corners of the target."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from uem_dolfinx.parallel import reduced
 class OfBothSides(ContactResults):
     """Results of a contact and of its second part; those of a second part itself are zero, so that sums over contacts are right."""
 
-    #: Whether another contact tells its results.
-    told_by_another = False
+    #: Whether its results are those of another contact, of which it is the second part.
+    is_second_part = False
     #: The second part: nodes at corners of the target, and the contactor's facets; None without.
     at_corners: Any = None
 
@@ -35,7 +35,7 @@ class OfBothSides(ContactResults):
 
     def _sum(self, what: str, together: Any, nothing: Any) -> Any:
         """A result of both parts (collective)."""
-        if self.told_by_another:
+        if self.is_second_part:
             return nothing
         return together([getattr(ContactResults, what).__get__(part) for part in self.parts_with_corners])
 
@@ -53,7 +53,7 @@ class OfBothSides(ContactResults):
     def force(self) -> fem.Function:
         """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
         f = super().force
-        if self.told_by_another:
+        if self.is_second_part:
             f.x.array[:] = 0.0
         elif self.at_corners is not None:
             f.x.array[:] += self.at_corners.all_forces()
@@ -78,7 +78,7 @@ class OfBothSides(ContactResults):
     def resultant(self, about: npt.ArrayLike | None = None, *, on: Literal["contactor", "target"] = "contactor") -> Resultant:
         """Force and moment that the contact exerts on one of the bodies; see ``ContactResults.resultant`` (collective)."""
         found = super().resultant(about, on=on)
-        if self.told_by_another:
+        if self.is_second_part:
             return Resultant(0.0 * found.force, 0.0 * found.moment)
         if self.at_corners is None:
             return found

@@ -25,6 +25,11 @@ from uem_dolfinx.parallel import reduced
 _orders = count(start=1)
 
 
+def _of_contact(name: str) -> property:
+    """An attribute that is always that of the contact; values set on its part have no effect."""
+    return property(lambda part: getattr(part._contact, name), lambda part, value: None)
+
+
 class CornerContact(Contact):
     """Part of a contact: nodes of its target; the contact tells its results.
 
@@ -34,7 +39,7 @@ class CornerContact(Contact):
         facets: of its contactor.
     """
 
-    told_by_another = True
+    is_second_part = True
     #: Corners are contactors here, and pass ends regularly.
     sees_corners = watches_ends = False
 
@@ -50,23 +55,8 @@ class CornerContact(Contact):
         assert of is not None
         return of
 
-    @property
-    def _friction(self) -> Any:
-        """Friction of the contact."""
-        return self._contact._friction
-
-    @_friction.setter
-    def _friction(self, value: Any) -> None:
-        pass
-
-    @property
-    def _offset(self) -> Any:
-        """Offset of the contact."""
-        return self._contact._offset
-
-    @_offset.setter
-    def _offset(self, value: Any) -> None:
-        pass
+    _friction: Any = _of_contact("_friction")
+    _offset: Any = _of_contact("_offset")
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         return self._nodes, MeshTarget(self._facets, averaged=self.normals == "averaged")

@@ -74,7 +74,7 @@ class HeatResults:
     @property
     def joule_power(self) -> float:
         """Power of electric currents that becomes heat in the contact; 0 without ``joule`` (collective)."""
-        made = [source.power().sum() for heat in self.pair.heats if heat.law.joule is not None for source in heat.sources[-1:]]
+        made = [source.power().sum() for heat in self.pair.heats for source in heat.sources if source.of_current]
         return float(reduced(self.config.comm, float(sum(made))))
 
     def heat_balance(self) -> float:

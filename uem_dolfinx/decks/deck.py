@@ -45,7 +45,7 @@ from uem_dolfinx.solve.steps.load_steps import load_steps
 from uem_dolfinx.solve.steps.step import Step as OfUsers
 
 #: Kinds of strains by the first letters of element types.
-STRAINS = {"C3D": "3d", "CPE": "plane_strain", "CPS": "plane_stress", "CAX": "axisymmetric"}
+STRAINS_OF_TYPES = {"C3D": "3d", "CPE": "plane_strain", "CPS": "plane_stress", "CAX": "axisymmetric"}
 #: Gaps up to this part of the model's size conduct heat: conductances of decks act before surfaces press.
 #: [convention; size of the model; test_deck_runs.py::test_gaps_that_conduct]
 CONDUCTS = 1e-4
@@ -78,9 +78,11 @@ class Deck(given.Sealed):
         self.mesh, self.tags, self.steps, self.left_out = mesh, tags, model.steps, model.left_out
         self._model, self._numbers, self._soft = model, numbers, soft
         self._by_name = {str(tag.name).upper(): tag for tag in map(tags.__getitem__, tags) if tag.name}
-        kinds = {STRAINS.get(name[:3], "") for name in model.types}
+        kinds = {STRAINS_OF_TYPES.get(name[:3], "") for name in model.types}
         if len(kinds) != 1 or "" in kinds:
-            raise InputError(f"elements are of the types {sorted(model.types)}: expected one family of {', '.join(STRAINS)}")
+            raise InputError(
+                f"elements are of the types {sorted(model.types)}: expected one family of {', '.join(STRAINS_OF_TYPES)}"
+            )
         (self._kind,) = kinds
         if self._kind == "axisymmetric":
             axisymmetric(mesh)
@@ -249,10 +251,8 @@ class Deck(given.Sealed):
         elif law.overclosure != "HARD":
             self.left_out.append(f"PRESSURE-OVERCLOSURE={law.overclosure} of '{name}': contact is hard")
         if law.conductance and self._model.thermal:
-            x, h = self.mesh.geometry.x, law.conductance[0][0]
-            ends = [reduced(self.mesh.comm, f(sign * x, axis=0), op=MPI.MAX) for sign, f in ((1.0, np.max), (-1.0, np.max))]
-            near = CONDUCTS * float(np.linalg.norm(ends[0] + ends[1]))
-            how["heat"] = Conductance(lambda p, g: np.where(g <= near, h, 0.0), field=1)
+            h = law.conductance[0][0]
+            how["heat"] = Conductance(lambda p, g: np.where(g <= CONDUCTS * self.problem.config.size, h, 0.0), field=1)
         return Contact(slave, master, **how)
 
     # -- the form --------------------------------------------------------------------------------------------------------

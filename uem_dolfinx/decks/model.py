@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
-from uem_dolfinx.decks.parts import KINDS, TEMPERATURE, Interaction, Material, Model, Pair, Step, Where
+from uem_dolfinx.decks.parts import STEP_KINDS, TEMPERATURE, Interaction, Material, Model, Pair, Step, Where
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.decks import Deck
 
@@ -19,9 +19,9 @@ OUTPUT = (
 #: Element types that lack nodes in the middle of faces and cells, or are integrated with fewer points or with incompatible modes.
 OTHERWISE = r"\d[RI]|C3D20|C(PS|PE|AX)8"
 #: Names of Abaqus for degrees of freedom that are held, from the first to the last.
-HOLDS = {"ENCASTRE": ("1", "6"), "PINNED": ("1", "3"), "XSYMM": ("1", "1"), "YSYMM": ("2", "2"), "ZSYMM": ("3", "3")}
+NAMED_HOLDS = {"ENCASTRE": ("1", "6"), "PINNED": ("1", "3"), "XSYMM": ("1", "1"), "YSYMM": ("2", "2"), "ZSYMM": ("3", "3")}
 #: Options that are taken, or that change nothing here; all others are left out.
-OPTIONS = {
+KNOWN_OPTIONS = {
     "ELASTIC": "TYPE", "EXPANSION": "TYPE ZERO", "SOLID SECTION": "ELSET MATERIAL ORIENTATION OFFSET", "MATERIAL": "NAME",
     "SURFACE INTERACTION": "NAME", "SURFACE BEHAVIOR": "PRESSURE-OVERCLOSURE", "CONTACT PAIR": "INTERACTION TYPE ADJUST SMALL_SLIDING",
     "TIE": "NAME POSITION_TOLERANCE ADJUST", "PRE-TENSION SECTION": "SURFACE NODE", "INITIAL CONDITIONS": "TYPE",
@@ -56,7 +56,7 @@ class _Reader:
 
     def take(self, keyword: str, options: dict[str, str], rows: list[list[str]]) -> bool:
         """Store the data of a keyword; whether it has a counterpart here."""
-        if keyword in KINDS:
+        if keyword in STEP_KINDS:
             times = [*_numbers(rows[0] if rows else []), 0.0, 0.0]
             duration = times[1] or 1.0
             self._step.kind, self._step.first, self._step.duration = keyword, times[0] or duration, duration
@@ -185,7 +185,7 @@ class _Reader:
         self._begins("BOUNDARY", self._step.held, options)
         for row in rows:
             where, first, last, value = [*row, "", ""][:4]
-            first, last = HOLDS.get(first.upper(), (first, last))
+            first, last = NAMED_HOLDS.get(first.upper(), (first, last))
             for dof in range(int(first), int(last or first) + 1):
                 if self._has(dof, _numbers([value])[0], "BOUNDARY"):
                     self._sets[where, dof] = None
@@ -350,7 +350,7 @@ def model_of(deck: Deck) -> Model:
         if not taken:
             left_out.append(f"*{keyword}")
             continue
-        unknown = [name for name in options if name and name.replace(" ", "_") not in OPTIONS.get(keyword, "").split()]
+        unknown = [name for name in options if name and name.replace(" ", "_") not in KNOWN_OPTIONS.get(keyword, "").split()]
         grow = ": values grow in proportion to the time of the step"
         left_out += [f"{name} of *{keyword}{grow if name == 'AMPLITUDE' else ''}" for name in unknown]
     left_out += [f"{n} elements of type {name}: they are no part of a body" for name, n in deck.left_out.items()]
@@ -358,7 +358,7 @@ def model_of(deck: Deck) -> Model:
     if reader.model.thickness != 1.0:
         left_out.append(f"thickness {reader.model.thickness}: forces of contacts and sections are those of a thickness of 1")
     if not reader.model.steps:
-        raise InputError(f"the deck has no step that can be taken: expected *STEP with one of {', '.join(KINDS)}")
+        raise InputError(f"the deck has no step that can be taken: expected *STEP with one of {', '.join(STEP_KINDS)}")
     reader.close()
     left_out[:] = dict.fromkeys(left_out)
     return reader.model

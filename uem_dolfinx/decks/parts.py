@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
-KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True}
+STEP_KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True}
 #: Number of the temperature among the degrees of freedom.
 #: [format; number; -]
 TEMPERATURE = 11
@@ -94,4 +94,4 @@ class Model:
     @property
     def thermal(self) -> bool:
         """Whether temperatures are unknown."""
-        return any(KINDS[step.kind] for step in self.steps)
+        return any(STEP_KINDS[step.kind] for step in self.steps)

@@ -14,6 +14,9 @@ from uem_dolfinx.geometry.raw import Group, RawMesh
 
 #: Name of the other face of a section.
 BACK = "{} back"
+#: A section whose nodes are off their plane by less than this part of its size is plane.
+#: [convention; size of the section; test_cuts.py::test_how_plane_a_section_must_be]
+PLANE = 1e-6
 
 
 def cut_along(raw: RawMesh, names: str | Sequence[str]) -> RawMesh:
@@ -74,11 +77,6 @@ def cut(raw: RawMesh, name: str) -> RawMesh:
     groups.append(Group(BACK.format(name), max(g.number for g in raw.groups) + 1, group.dim, np.sort(moved[group.rows], axis=1)))
     of_file = None if raw.of_file is None else np.append(raw.of_file, raw.of_file[doubled])
     return replace(raw, points=np.concatenate([raw.points, x]), cells=cells, groups=groups, of_file=of_file)
-
-
-#: A section whose nodes are off their plane by less than this part of its size is plane.
-#: [convention; size of the section; test_cuts.py::test_how_plane_a_section_must_be]
-PLANE = 1e-6
 
 
 def _check_through(

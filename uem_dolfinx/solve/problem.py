@@ -344,31 +344,33 @@ class UnitedProblem(given.Sealed):
         self.bodies.wanted[:] = self.bodies.of_owners(ramped(self.load, self.bodies.bcs, start, wanted, fraction))
         try:
             self.bodies.begin_step()
-            if self.linear is not None:
-                self.linear.begin_step(self.config.of(start)[: self.config.n_owned], fraction)
-            self.system.begin_step()
-            history = solve_united(
-                self.bodies,
-                self.system if along is None else along,
-                rtol=self.rtol,
-                max_iterations=self.max_iterations,
-                line_search=self.line_search and along is None,
-                verbose=self.verbose,
-                forces_before=self.largest_forces,
-                check_signals=lambda: self.progress.check_signals(self.comm),
-            )
-            self.system.end_step()
-            if on := {id(contact.pair.whole) for contact in self.contacts if contact.on}:
-                from uem_dolfinx.solve.passages import refuse_passages
-
-                pairs, motions = zip(*(p for p in zip(self.interfaces, self.motions) if id(p[0]) in on))
-                refuse_passages(self.config, pairs, self.committed, motions, moving=self.dynamics is not None)
+            history = self.converge(self.bodies, self.system, start, fraction, along)
         except UEMError as error:
             stiffness = self.bodies.stiffness
             self.restore()
             if isinstance(error, MENDABLE):
                 self.watch.name_corner(stiffness, error)
             raise
+        return history
+
+    def converge(
+        self, bodies: Bodies, system: Any, start: np.ndarray, fraction: float = 1.0, along: ContactMethod | None = None
+    ) -> list[Iteration]:
+        """Solve the united ``system`` of ``bodies``, its own or others in their place, see ``attempt``; the state stays (collective)."""
+        if self.linear is not None:
+            self.linear.begin_step(self.config.of(start)[: self.config.n_owned], fraction)
+        system.begin_step()
+        history = solve_united(
+            bodies, system if along is None else along, rtol=self.rtol, max_iterations=self.max_iterations,
+            line_search=self.line_search and along is None, verbose=self.verbose, forces_before=self.largest_forces,
+            check_signals=lambda: self.progress.check_signals(self.comm),
+        )  # fmt: skip
+        system.end_step()
+        if on := {id(contact.pair.whole) for contact in self.contacts if contact.on}:
+            from uem_dolfinx.solve.passages import refuse_passages
+
+            pairs, motions = zip(*(p for p in zip(self.interfaces, self.motions) if id(p[0]) in on))
+            refuse_passages(self.config, pairs, self.committed, motions, moving=self.dynamics is not None)
         return history
 
     def commit(self) -> None:

@@ -22,8 +22,8 @@ from uem_dolfinx.parallel import agreed, ask_together
 OfState: TypeAlias = float | Callable[..., npt.ArrayLike]
 
 CONDUCTANCE = given.Range("0 or a positive number, infinity, or a function of pressures and gaps", lambda x: x >= 0)
-SHARE = given.Range("a number from 0 to 1, or None for no heat of friction", lambda x: (x >= 0) & (x <= 1))
 PART = given.Range("a number from 0 to 1", lambda x: (x >= 0) & (x <= 1))
+SHARE = given.Range(f"{PART.words}, or None for no heat of friction", PART.holds)
 
 
 class Conductance(given.Sealed):

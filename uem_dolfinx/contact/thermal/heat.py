@@ -272,18 +272,21 @@ class Heat:
         h = self.law.conductances(pair.config.comm, pair.name, state, closed)
         return np.where((closed | ~pair.off) & self.passage.leads, h, 0.0)
 
-    def _slopes(self, k: int) -> Array:
-        """Derivatives of the power by argument k of h ``(n,)`` (collective).
+    def _slopes(self, *which: int) -> list[Array]:
+        """Derivatives of the power by some arguments of h, each ``(n,)`` (collective).
 
         The pressure, argument 0, changes at closed contactors, and the gap, argument 1, at open ones.
         """
         state, closed = self._state(), self.pair.united
-        largest = reduced(self.pair.config.comm, float(np.abs(state[k]).max(initial=0.0)), op=MPI.MAX)
-        changes = (closed, ~closed & (self.pair.projection.gap > 0.0))[k] if k < 2 else np.ones(len(closed), dtype=bool)
-        more = np.where(changes, OF_CONDUCTANCE * largest, 0.0)
-        ahead = self._conductances(*state[:k], state[k] + more, *state[k + 1 :])
-        slopes = (ahead - self._conductances(*state)) / np.where(more > 0.0, more, 1.0)
-        return np.asarray(slopes * self.jump() * self.passage.areas)
+        largest = reduced(self.pair.config.comm, np.array([np.abs(part).max(initial=0.0) for part in state]), op=MPI.MAX)
+        every = np.ones(len(closed), dtype=bool)
+        changes = closed, ~closed & (self.pair.projection.gap > 0.0), every, every
+        here, scale, found = self._conductances(*state), self.jump() * self.passage.areas, []
+        for k in which:
+            more = np.where(changes[k], OF_CONDUCTANCE * largest[k], 0.0)
+            ahead = self._conductances(*state[:k], state[k] + more, *state[k + 1 :])
+            found.append(np.asarray((ahead - here) / np.where(more > 0.0, more, 1.0) * scale))
+        return found
 
     def jump(self) -> Array:
         """Temperature of contactors minus temperature of the target ``(n,)`` (collective)."""
@@ -350,16 +353,14 @@ class Heat:
         found = [(self.conductances() * at.areas, self.jumps())]
         if callable(self.law.h):
             opening = Terms(at.row, at.node, at.jump[:, None] * pair.projection.normal[at.row])
-            found.append((np.where(pair.united, 0.0, self._slopes(1)), opening))
-        if self.law.of_temperatures:
-            found += [
-                (self._slopes(2 + k), self._terms(self._of, self._shares(side))) for k, side in enumerate((at.own, at.theirs))
-            ]
+            sides = [self._terms(self._of, self._shares(side)) for side in (at.own, at.theirs) if self.law.of_temperatures]
+            by_gaps, *others = self._slopes(*range(1, 2 + len(sides)))
+            found += [(np.where(pair.united, 0.0, by_gaps), opening), *zip(others, sides)]
         return found
 
     def by_pressures(self) -> Array:
         """Derivatives of the power by the pressures of closed contactors ``(n,)`` (collective)."""
-        return self._slopes(0) if callable(self.law.h) else np.zeros(len(self.passage.areas))
+        return self._slopes(0)[0] if callable(self.law.h) else np.zeros(len(self.passage.areas))
 
     def tangent(self) -> list[tuple[Ints, Array]]:
         """Derivatives of the residual by temperatures and gaps (collective).

@@ -17,6 +17,8 @@ class Source(Protocol):
     """Heat that enters both sides at contactors."""
 
     share: float
+    #: Whether it is the work of an electric current.
+    of_current: bool
 
     @property
     def lags(self) -> bool:
@@ -68,7 +70,7 @@ class FrictionalHeat:
         share: part that enters the contactor.
     """
 
-    lags = True
+    lags, of_current = True, False
 
     def __init__(self, heat: Flow, share: float):
         self.share, self._pair, self._law = share, heat.pair, heat.law
@@ -105,6 +107,8 @@ class JouleHeat:
         currents: conductances of the potential.
         share: part that enters the contactor.
     """
+
+    of_current = True
 
     def __init__(self, currents: Sequence[Flow], share: float):
         self.share, self._currents = share, [one for one in currents if not one.law.perfect]

@@ -22,8 +22,6 @@ from uem_dolfinx.contact.warnings.checks import check_moved
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
 from uem_dolfinx.errors import MassError, UEMError
 from uem_dolfinx.solve.bodies.bodies import Bodies, solver_of
-from uem_dolfinx.solve.passages import refuse_passages
-from uem_dolfinx.solve.united.newton import solve_united
 from uem_dolfinx.solve.united.system import BodySystem
 
 #: Masses are diagonal: a factorisation fills in where contacts couple unknowns alone.
@@ -121,7 +119,9 @@ class StepperWithMass(ExplicitStepper):
             bodies.begin(dt, free_to[:n])
             bodies.u.x.array[:] = free_to
             bodies.u.x.scatter_forward()
-            history = self._settle()
+            for pair in problem.interfaces:
+                check_moved(pair)
+            history = problem.converge(bodies, self.system, problem.committed)
         except UEMError:
             problem.restore()
             raise
@@ -141,29 +141,6 @@ class StepperWithMass(ExplicitStepper):
         solver.set_operator(P, M, None, Q)
         dq, _ = solver.solve(Q.transpose(forms.product(M, self.problem.config.unknowns.vector(change))), 0.0)
         return np.array(P.expand(solver.complete(dq)).array_r)[: self._n]
-
-    def _settle(self) -> Any:
-        """Correct the freely moved state by contact (collective)."""
-        problem = self.problem
-        for pair in problem.interfaces:
-            check_moved(pair)
-        if problem.linear is not None:
-            n, g = problem.config.n_owned, problem.config.gdim
-            problem.linear.begin_step(problem.committed[: n * g].reshape(n, g), 1.0)
-        self.system.begin_step()
-        history = solve_united(
-            self.bodies,
-            self.system,
-            rtol=problem.rtol,
-            max_iterations=problem.max_iterations,
-            line_search=problem.line_search,
-            verbose=problem.verbose,
-            forces_before=problem.largest_forces,
-            check_signals=lambda: problem.progress.check_signals(problem.comm),
-        )
-        self.system.end_step()
-        refuse_passages(problem.config, problem.interfaces, problem.committed, problem.motions, moving=True)
-        return history
 
     def _accelerations(self) -> Array:
         """Accelerations of the moving components under the forces of the bodies, zero elsewhere ``(n,)`` (collective)."""

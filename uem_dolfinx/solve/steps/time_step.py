@@ -57,10 +57,7 @@ def touching(problem: Any) -> list[bool]:
 
 def events(problem: Any, before: list[bool], after: list[bool]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the contacts that have closed, and of those that have opened, by whether each had active contactors."""
-    told = [not contact.told_by_another for contact in problem.contacts]
-    names, before, after = (
-        [one for one, is_told in zip(ones, told) if is_told]
-        for ones in ([contact.name for contact in problem.contacts], before, after)
-    )
+    # second parts come last
+    names = [contact.name for contact in problem.contacts if not contact.is_second_part]
     touched = tuple(name for name, was, now in zip(names, before, after) if now and not was)
     return touched, tuple(name for name, was, now in zip(names, before, after) if was and not now)

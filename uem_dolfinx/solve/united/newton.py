@@ -390,7 +390,6 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
     start, state, dq = bodies.displacement(), problem.state, step.dq
     work_of, norms = bodies.unknowns.work, bodies.unknowns.norms
     # the residual is the negative right-hand side at first
-    norm = driving(bodies, state.test, step.rhs, step.du)
     work, length = -work_of(dq, step.rhs), step.longest
     while True:
         last = not line_search or length <= SHORTEST_SEARCH
@@ -404,7 +403,7 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
             downhill = problem.convex and along < 0.0
             if downhill and not less_work and length == 1.0:
                 return _downhill(bodies, method, state, start, step)
-            if less_work or downhill or first(norms(residual)) <= enough * norm:
+            if less_work or downhill or first(norms(residual)) <= enough * driving(bodies, state.test, step.rhs, step.du):
                 return length
         elif last:
             where = bodies.inverted()
