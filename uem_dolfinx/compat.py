@@ -152,18 +152,21 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
 @kept()
 def _mixed_space(domain: Any, elements: list[Any]) -> Any:
     if DOLFINX_VERSION < (0, 7):
-        return fem.FunctionSpace(domain, ufl.MixedElement(elements))
+        return space_of(domain, ufl.MixedElement(elements))
     from basix.ufl import mixed_element
 
-    return fem.functionspace(domain, mixed_element(elements))
+    return space_of(domain, mixed_element(elements))
+
+
+def space_of(domain: Any, element: Any) -> Any:
+    """Space of functions of an element, by UFL or as a tuple."""
+    return getattr(fem, "functionspace", fem.FunctionSpace)(domain, element)
 
 
 @kept()
 def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any:
-    if hasattr(fem, "functionspace"):
-        return fem.functionspace(domain, (family, degree, shape) if shape else (family, degree))
-    if shape == ():
-        return fem.FunctionSpace(domain, (family, degree))
+    if hasattr(fem, "functionspace") or shape == ():
+        return space_of(domain, (family, degree, shape) if shape else (family, degree))
     if len(shape) == 1:
         return fem.VectorFunctionSpace(domain, (family, degree), dim=shape[0])
     return fem.TensorFunctionSpace(domain, (family, degree), shape=shape)
@@ -174,13 +177,12 @@ def quadrature_space(domain: Any, degree: int, shape: Sequence[int] = ()) -> Any
     if DOLFINX_VERSION >= (0, 7):
         from basix.ufl import quadrature_element
 
-        element = quadrature_element(cell_name(domain), value_shape=tuple(shape), scheme="default", degree=degree)
-        return fem.functionspace(domain, element)
+        return space_of(domain, quadrature_element(cell_name(domain), value_shape=tuple(shape), scheme="default", degree=degree))
     kind, more = (
         (ufl.FiniteElement, {}) if not shape else (ufl.VectorElement, {"dim": shape[0]}) if len(shape) == 1
         else (ufl.TensorElement, {"shape": tuple(shape)})
     )  # fmt: skip
-    return fem.FunctionSpace(domain, kind("Quadrature", domain.ufl_cell(), degree, quad_scheme="default", **more))
+    return space_of(domain, kind("Quadrature", domain.ufl_cell(), degree, quad_scheme="default", **more))
 
 
 def evaluate(compiled: fem.Expression, domain: Any, cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:

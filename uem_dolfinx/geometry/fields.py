@@ -118,9 +118,22 @@ class ConfigurationAmongFields(Configuration):
         W, found = self.whole.function_space, {"displacement": (fem.Function(self.V, name="displacement"), self.dofs.ravel())}
         for i in range(W.num_sub_spaces):
             if i != self.part:
-                V, dofs = W.sub(i).collapse()
-                found[f"field_{i}"] = fem.Function(V, name=f"field_{i}"), np.asarray(dofs, dtype=np.int64).ravel()
+                V, dofs = self._space_of_part(i)
+                found[f"field_{i}"] = fem.Function(V, name=f"field_{i}"), dofs
         return found
+
+    def _space_of_part(self, i: int) -> tuple[Any, Ints]:
+        """A space for part i alone, and the local unknowns of w for its own ``(n,)`` (collective).
+
+        DOLFINx 0.5's ``collapse`` would end the process on a rank without cells.
+        """
+        W = self.whole.function_space
+        V = compat.space_of(W.mesh, W.sub(i).ufl_element())
+        block, numbers = V.dofmap.bs, V.dofmap.index_map
+        dofs = np.zeros(block * (numbers.size_local + numbers.num_ghosts), dtype=np.int64)
+        if len(nodes := compat.cell_dofs(V)):
+            dofs[(block * nodes[:, :, None] + np.arange(block)).ravel()] = compat.part_dofs(W, i).ravel()
+        return V, dofs
 
     def functions(self) -> dict[str, fem.Function]:
         """The displacement and all other fields (part 1 is ``field_1``) as separate, current Functions (first call: collective)."""
