@@ -35,6 +35,15 @@ def sums_of_groups(values: Array, first: Ints, order: Ints | None = None) -> Arr
     return np.asarray(found).reshape(len(first), *values.shape[1:])
 
 
+def largest_of_groups(group: Ints, values: Array, count: int) -> Array:
+    """Largest of the values ``(m,)`` of each group ``(count,)``, 0 for those without; a faster ``numpy.maximum.at`` for one group."""
+    if count == 1:
+        return np.array([values.max(initial=0.0)])
+    largest = np.zeros(count)
+    np.maximum.at(largest, group, values)
+    return largest
+
+
 def cross_products(a: Array, b: Array) -> Array:
     """Cross products of 3D vectors ``a`` and ``b (..., 3)``; a faster ``numpy.cross``."""
     ahead, back = [1, 2, 0], [2, 0, 1]

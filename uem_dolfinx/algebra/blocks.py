@@ -56,15 +56,15 @@ def product(A: Blocks, B: Blocks) -> Blocks:
     # for blocks of single numbers SciPy drops zeros, so that the sparsity would depend on values
     wide = np.zeros((len(B.row), g, max(g, 2)))
     wide[:, :, :g] = B.value
-    left = _in_rows(of_row, at[kept], A.value[kept], len(rows))
-    right = _in_rows(of_inner, of_column, wide, len(inner))
+    left = in_rows(of_row, at[kept], A.value[kept], len(rows))
+    right = in_rows(of_inner, of_column, wide, len(inner))
     C = bsr_matrix(left, shape=(g * len(rows), g * len(inner))) @ bsr_matrix(
         right, shape=(g * len(inner), wide.shape[2] * len(columns))
     )
     return Blocks(np.repeat(rows, np.diff(C.indptr)), columns[C.indices], C.data[:, :, :g])
 
 
-def _in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array, Ints, Ints]:
+def in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array, Ints, Ints]:
     """Blocks in the order of their rows, their columns, and the start of each row."""
     order = np.argsort(row, kind="stable")
     return value[order], column[order], np.append(0, np.cumsum(np.bincount(row, minlength=n_rows)))

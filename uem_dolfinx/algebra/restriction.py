@@ -120,7 +120,8 @@ class Restriction:
             if (left < MOSTLY_PRESCRIBED).any():
                 error = error or self._conflict(int(at[np.argmin(left)]), rows.shape[1])
                 continue
-            pinv: Array = np.asarray(np.linalg.pinv(A))
+            # of one direction, without singular values
+            pinv = np.asarray(np.linalg.pinv(A)) if rows.shape[1] > 1 else A.transpose(0, 2, 1) / (A**2).sum(axis=2)[:, :, None]
             lift[rows] = pinv.transpose(0, 2, 1)
             frames[np.searchsorted(self.nodes, at)] = _frames(A, pinv, self.free[at])
         return frames, lift, error

@@ -14,7 +14,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Bools, Ints, sums_of_rows
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, sums_of_rows
 from uem_dolfinx.errors import MeshError
 from uem_dolfinx.parallel import Exchange, agree, gathered, reduced
 
@@ -150,7 +150,7 @@ class Nodes:
         (owned,) = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes)
         return np.unique(owned) - self.first
 
-    def ask_owners(self, nodes: Ints, values: Array) -> Array:
+    def ask_owners(self, nodes: Ints, values: AnyArray) -> Any:
         """Values ``(n_owned, k)`` of the nodes' owners at global ``nodes (m,)``: ``(m, k)`` (collective)."""
         return Halo(self, nodes).take(lambda own: values[own])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -17,12 +18,13 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import check_fields
-from uem_dolfinx.arrays import AnyArray, Array, Bools
+from uem_dolfinx.arrays import AnyArray, Array, Bools, largest_of_groups
 from uem_dolfinx.errors import InputError, NotFiniteError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.bodies.linear_forces import explicit_forces
 from uem_dolfinx.solve.bodies.norms import first
 from uem_dolfinx.solve.bodies.tangent import Inversions, Tangent
 
@@ -108,6 +110,8 @@ class Bodies:
         self._stiffness_of = -1
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self._inversions = Inversions(config) if check and config.moves else None
+        #: Writes F at the present displacement to a vector.
+        self._assemble = explicit_forces(self, J) or partial(forms.assemble_vector, L=self._F)
         self._fields: Any = None
         if self.unknowns.mixed:
             from uem_dolfinx.solve.bodies.field_scales import FieldScales
@@ -137,7 +141,7 @@ class Bodies:
         if self.dynamics is not None:
             self.dynamics.update_rates()
         with timed("assemble residual"):
-            forms.assemble_vector(self._b, self._F)
+            self._assemble(self._b)
             if self.points is not None:
                 self.points.add_forces(self._b.array)
             if self.dead is not None:
@@ -163,9 +167,8 @@ class Bodies:
 
     def forces_at_work(self, F: PETSc.Vec) -> Any:
         """Reference for the size of residuals: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
-        if self._fields is None:
-            return self._beside(F.norm(), [one.size() for one in self._added])
-        return self._beside(np.maximum(self.unknowns.norms(F), self._fields.terms()), [one.size() for one in self._added])
+        norm = F.norm() if self._fields is None else np.maximum(self.unknowns.norms(F), self._fields.terms())
+        return self._beside(norm, [one.size() for one in self._added])
 
     @property
     def _added(self) -> list[Any]:
@@ -203,9 +206,7 @@ class Bodies:
         return self._diagonal()
 
     def _diagonal(self) -> Array:
-        diagonal = self.unknowns.vector()
-        self.tangent.K.getDiagonal(diagonal)
-        return np.array(diagonal.array_r).reshape(-1, self.config.block)[: self.config.n_owned]
+        return np.array(self.tangent.K.getDiagonal().array_r).reshape(-1, self.config.block)[: self.config.n_owned]
 
     def rounding(self, positioned: npt.NDArray[np.integer]) -> Any:
         """Norm of the forces due to rounding of the displacement, and of the positions of some nodes (collective).
@@ -248,12 +249,11 @@ class Bodies:
         Args:
             positioned: whether positions are rounded, not displacements alone.
         """
-        F, n = self.forces, self.config.n_owned
         if self.stiffness is None:
             return self.unknowns.norms(self.residual)
+        F, n = self.forces, self.config.n_owned
         body, count = find_bodies(self.config)
-        rounded = np.zeros(count)
-        np.maximum.at(rounded, body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0))
+        rounded = largest_of_groups(body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0), count)
         self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
         own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
         limit = ABOVE_ROUNDING * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]

@@ -85,6 +85,11 @@ class Tangent:
         #: Number of assemblies.
         self.number = 0
 
+    @property
+    def completed(self) -> bool:
+        """Whether K has entries on its diagonal that are no derivatives."""
+        return self._lacks
+
     def hold(self, free: Bools) -> None:
         """Set the mask of components without Dirichlet condition ``(n_rows, gdim)``; the sparsity of K includes all components."""
         self._free = free

@@ -19,13 +19,11 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.warnings.checks import check_moved
+from uem_dolfinx.dynamics.explicit.mass_solver import MassSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
 from uem_dolfinx.errors import MassError, UEMError
-from uem_dolfinx.solve.bodies.bodies import Bodies, solver_of
+from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.united.system import BodySystem
-
-#: Masses are diagonal: a factorisation fills in where contacts couple unknowns alone.
-OPTIONS = {"ksp_type": "preonly", "pc_type": "lu"}
 
 
 class InertBodies(Bodies):
@@ -93,7 +91,7 @@ class StepperWithMass(ExplicitStepper):
                 "a density, or take contactors='massless'"
             )
         self.bodies = InertBodies(problem.bodies, self._mass)
-        solver = solver_of(problem.config, "uem_masses_", OPTIONS)
+        solver = MassSolver(problem.config.unknowns, "uem_masses_")
         self.system = BodySystem(self.bodies, problem.interfaces, solver, consistent_tangent=False, linear=problem.linear)
 
     def begin(self) -> None:
