@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from contextlib import contextmanager
+from contextlib import ContextDecorator, contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from mpi4py import MPI
@@ -45,23 +45,33 @@ STAGES = (
     "corners of the target", "cross out prescribed components", "deflation", "eigenvalues", "estimate errors",
     "factorisation or preconditioner set-up", "first acceleration", "inertia forces", "linear solve", "projection", "read checkpoint",
     "read mesh", "redistribute mass", "restriction matrix P", "return mapping", "search", "search and projection", "segments",
-    "solve without the contact", "united matrix", "united matrix P'KP", "united matrix Q'KP", "uniting equations", "write checkpoint",
-    "write fields", "write surfaces", "write table",
+    "solve without the contact", "united matrix", "united matrix P'KP", "united matrix P'MP", "united matrix Q'KP", "uniting equations",
+    "write checkpoint", "write fields", "write surfaces", "write table",
 )  # fmt: skip
 #: Stages that have been timed so far, in the order of their first time.
 _stages: dict[str, None] = {}
 
 
-@contextmanager
-def timed(stage: str) -> Iterator[None]:
-    """Time a stage of the method; ``dolfinx.common.list_timings`` shows it as ``~UEM: stage``.
+class timed(ContextDecorator):  # noqa: N801
+    """Time a stage of the method, as a context or a decorator; ``dolfinx.common.list_timings`` shows it as ``~UEM: stage``.
 
     Args:
         stage: name of the stage, e.g. ``"search"``.
     """
-    _stages[stage] = None
-    with Timer(f"~UEM: {stage}"):
-        yield
+
+    def __init__(self, stage: str):
+        self._stage = stage
+
+    def _recreate_cm(self) -> timed:
+        return timed(self._stage)
+
+    def __enter__(self) -> None:
+        _stages[self._stage] = None
+        self._timer = Timer(f"~UEM: {self._stage}")
+        self._timer.__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self._timer.__exit__(*error)
 
 
 class Timings(dict[str, tuple[int, float]]):

@@ -12,6 +12,8 @@ from helpers import at, box, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.dynamics.explicit.mass_solver import MassSolver
 from uem_dolfinx.parallel import reduced
 
 COMM = MPI.COMM_WORLD
@@ -105,6 +107,27 @@ def disc(middle):
         return np.column_stack([x[:, 0] * np.sqrt(1 - x[:, 1] ** 2 / 2), x[:, 1] * np.sqrt(1 - x[:, 0] ** 2 / 2)]) + middle
 
     return box("quadrilateral", [-1.0, -1.0], [1.0, 1.0], [6, 6]).mapped(onto)
+
+
+@pytest.mark.parametrize("how", [{"dim": 2}, {"dim": 2, "coupling": "mortar"}, {"dim": 3, "cells": 10}], ids=str)
+def test_united_masses(how):
+    """The solution of P'MP is that of a factorisation of all unknowns, on any ranks; G and a Q of its own as well."""
+    problem, contact, _ = bars(lower=True, wide=2, gap=0.0, **how)
+    problem.contacts[0].pair.activate_touching()
+    space, rows = problem.config.unknowns, problem.system._rows()
+    P, M = rows.test, problem.bodies.update_tangent().copy()
+    M.zeroEntries()
+    assert rows.test.n_equations > 0
+    wave = space.vector(1.0 + np.random.default_rng(3 + COMM.rank).random(space.block * space.n_owned))
+    M.setDiagonal(wave)
+    M.assemble()
+    for G in (None, M):
+        found, expected = MassSolver(space, "masses_"), UnitedSolver(space, "all_", {"ksp_type": "preonly", "pc_type": "lu"})
+        rhs = P.transpose(space.vector(wave.array_r**2))
+        for solver in (found, expected):
+            solver.set_operator(P, M, G)
+        one, other = (P.expand(solver.complete(solver.solve(rhs)[0])) for solver in (found, expected))
+        assert (one - other).norm() <= 1e-10 * other.norm()
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 from mpi4py import MPI
 
@@ -13,14 +13,11 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.dynamics.explicit.refused import is_explicit
+from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
 from uem_dolfinx.parallel import reduced
 
-if TYPE_CHECKING:
-    from uem_dolfinx.solve.bodies.bodies import Bodies
 
-
-def explicit_forces(bodies: Bodies, J: ufl.Form | None) -> Callable[[PETSc.Vec], None] | None:
+def explicit_forces(bodies: Any, J: ufl.Form | None) -> Callable[[PETSc.Vec], None] | None:
     """How linear bodies write their residual F(u) to a vector in explicit steps, where K has no inertia; None for others.
 
     Args:
@@ -28,7 +25,7 @@ def explicit_forces(bodies: Bodies, J: ufl.Form | None) -> Callable[[PETSc.Vec],
         J: tangent of users, or None.
     """
     dynamics = bodies.dynamics
-    if dynamics is None or not is_explicit(dynamics) or dynamics.damping is not None:
+    if dynamics is None or not isinstance(dynamics.scheme, CentralDifferences) or dynamics.damping is not None:
         return None
     return LinearForces(bodies).assemble if bodies.linear and bodies.points is None and J is None else None
 
@@ -40,7 +37,7 @@ class LinearForces:
         bodies: whose K is constant, and has no inertia.
     """
 
-    def __init__(self, bodies: Bodies):
+    def __init__(self, bodies: Any):
         self._bodies, self._inputs = bodies, [one for one in forms.with_derivatives(bodies.F)[1] if one is not bodies.u]
         self._form = forms.form(bodies.F)
         #: Values of Constants and Functions at the last call, and F(0) with them; None until it is needed.
