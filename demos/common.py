@@ -138,7 +138,8 @@ def numbers(text: str, mark: str = ",") -> list[int]:
 def outside_mpi() -> dict[str, str]:
     """Environment of a process that takes no part in the MPI of this one."""
     own = ("OMPI_", "PMI", "HYD", "MPI_")
-    return {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith("OMPI_ALLOW")}
+    kept = ("OMPI_ALLOW", "OMPI_MCA_ess_singleton")
+    return {k: v for k, v in os.environ.items() if not k.startswith(own) or k.startswith(kept)}
 
 
 def free_memory() -> None:
