@@ -121,7 +121,7 @@ if args.output:
         f"{args.output}/adapt_hertz", found.problem, fields={"error_estimate": found.estimate.cells}
     ) as writer:
         writer.write(1.0)
-with uem.figure(args.plot, comm, panels=2, size=(7.0, 3.2)) as (left, right):
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.2)) as (left, right):
     uem.plot_scene(found.problem, left, window=(0, 6 * a, -3 * a, 3 * a), label="displacement")
     if right:
         fine = np.linspace(0.0, 1.0, 200)

@@ -94,7 +94,7 @@ if args.output:
         f"{args.output}/adapt_punch", finest.problem, fields={"error_estimate": finest.estimate.cells}
     ) as writer:
         writer.write(1.0)
-with uem.figure(args.plot, comm, panels=2, size=(7.0, 3.2)) as (left, right):
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.2)) as (left, right):
     shown = uem.adapt(lambda size: punch(2, size), tolerance=0.02).problem
     uem.plot_scene(shown, left, label="displacement", window=(0, 2, -2, 0.1))
     if right:
@@ -104,4 +104,4 @@ with uem.figure(args.plot, comm, panels=2, size=(7.0, 3.2)) as (left, right):
                 x, y = ([row[key] for row in own] for key in ("cells", "error"))
                 right.loglog(x, y, marker, color=colour, ms=4, label=f"{name}, degree {degree}")
         right.set(xlabel="number of cells", ylabel="error in the energy norm", ylim=(1e-3, 0.5))
-        right.legend(loc="lower right", fontsize=8)
+        right.legend(loc="lower left")

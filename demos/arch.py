@@ -97,7 +97,7 @@ results = {
 common.report(args, results)
 
 # %%
-with uem.figure(args.plot, comm, panels=2, size=(7.0, 3.6)) as (left, right):
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.6)) as (left, right):
     uem.plot_scene(problem, left, mirror=True, arrows=True)
     if right:
         left.set_aspect("auto")

@@ -114,26 +114,25 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=3, size=(5.2, 4.0)) as panels:
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as panels:
         if panels[0] is not None:
             exact = [(0.0, 0.5, 7 / 6, 1.5), (0.0, 300.0, 0.0, 0.0)]
             falls = [(0, 1, 1, 5 / 3, 5 / 3, 11 / 3, 11 / 3, 13 / 3, 13 / 3, 19 / 3, 19 / 3, 7, 7, 7.3),
                      (0, 0, 300, 500, 0, 0, 500, 300, 0, 0, 300, 500, 0, 0)]  # fmt: skip
-            panels[0].step(*exact, where="post", color="0.3", lw=1, label="exact")
-            panels[0].plot(flight[:, 0], flight[:, 1], ".-", ms=2, lw=0.7, label="massless contactors")
-            panels[1].plot(massy[:, 0], massy[:, 1], ".-", ms=2, lw=0.7, color="C3", label="contactors with mass")
-            panels[1].step(*exact, where="post", color="0.3", lw=1, label="exact")
+            panels[0].plot(massy[:, 0], massy[:, 1], ".-", ms=2, lw=0.7, color="C3", alpha=0.35, label="contactors with mass")
+            panels[0].step(*exact, where="post", color="k", lw=2.5, label="exact")
+            panels[0].plot(flight[:, 0], flight[:, 1], lw=1.5, color="C9", label="massless contactors")
             time, pressure = (np.array(part, dtype=float) for part in falls)
             fine = np.linspace(0.0, time[-1], 2001)
             p = np.interp(fine, time + 1e-9 * np.arange(len(time)), pressure)
             pushed = np.concatenate([[0.0], np.cumsum(np.diff(fine) * (p[1:] + p[:-1]) / 2)])
-            panels[2].plot(fine, -g * fine + pushed / (rho * L), color="0.3", lw=2.5, alpha=0.4, label="exact")
-            panels[2].plot(drop[:, 0], drop[:, 2], lw=1, label="dropped: mean velocity")
-            panels[2].set(ylabel="mean velocity")
+            panels[1].plot(fine, -g * fine + pushed / (rho * L), color="0.3", lw=2.5, alpha=0.4, label="exact")
+            panels[1].plot(drop[:, 0], drop[:, 2], lw=1, label="dropped bar, massless contactors")
+            panels[1].set(ylabel="mean velocity")
             for ax in panels:
                 ax.set(xlabel="time", ylabel=ax.get_ylabel() or "contact pressure")
                 ax.grid(alpha=0.25)
-                ax.set_ylim(top=1.2 * ax.get_ylim()[1])
+                ax.set_ylim(top=1.35 * ax.get_ylim()[1])
                 ax.legend(frameon=False, loc="upper left")
 
 # %%

@@ -101,7 +101,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(5.2, 4.0)) as panels:
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as panels:
         if panels[0] is not None:
             swap = [0.0, meet, meet + 2 * L / c, t[-1]]
             for v, label, ends in ((v1, "lower bar", (args.v1, args.v2)), (v2, "upper bar", (args.v2, args.v1))):

@@ -91,7 +91,7 @@ def solve(name: str, limit: float, panels: list[object]) -> tuple[dict[str, floa
 PEEQ = list(np.linspace(0.0, 0.2, 11))
 if args.plot:
     frames_file = args.plot.replace(".png", "_frames.png")
-    with uem.figure(frames_file, comm, panels=4, size=(3.4, 4.4)) as panels:
+    with uem.figure(frames_file, comm, panels=4, size=(2.5, 4.4)) as panels:
         plastic, plastic_history = solve("plastic", yield_stress, list(panels))
 else:
     plastic, plastic_history = solve("plastic", yield_stress, [])

@@ -96,7 +96,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(6.0, 4.2)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.2)) as (left, right):
         if left:
             for k, (mu, (angle, tension, history)) in enumerate(curves.items()):
                 left.plot(angle, tension, ".", ms=3, color=f"C{k}", label=f"mu = {mu}")
@@ -104,7 +104,7 @@ if args.plot:
                 right.plot(np.linspace(0, 2, args.steps + 1), [row["T1/T2"] for row in history], ".-", color=f"C{k}")
                 right.axhline(np.exp(mu * np.pi), color=f"C{k}", lw=0.8, ls="--")
             left.set(xlabel="angle from the slack end", ylabel="pressure R / T2, lines: exp(mu phi)", ylim=(0, 6))
-            right.set(xlabel="way of the tight end over its stretch", ylabel="T1 / T2")
+            right.set(xlabel="displacement of the tight end / its elongation", ylabel="T1 / T2")
             for ax in (left, right):
                 ax.grid(alpha=0.25)
             left.legend(frameon=False)

@@ -88,7 +88,7 @@ if args.plot:
     mode = sticking.functions[1].x.array
     problem.u.x.array[:] = 0.04 * mode / max(comm.allgather(np.abs(mode).max(initial=0.0)))
     with uem.figure(args.plot, comm) as (panel,):
-        uem.plot_scene(problem, panel, arrows=False)
+        uem.plot_scene(problem, panel, label="displacement of the second mode", cells=False, arrows=False)
 if args.output:
     with uem.ResultsWriter(f"{args.output}/blade", problem) as writer:
         writer.write(1.0)

@@ -95,7 +95,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(7.5, 3.6)) as panels:
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.6)) as panels:
         book.plot(panels[1])
         if comm.rank == 0:
             import matplotlib

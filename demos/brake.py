@@ -140,7 +140,7 @@ if args.output:
 # The temperature through the pad, and in block and base.
 
 # %%
-with uem.figure(args.plot, comm, panels=2, size=(7.0, 3.0)) as (left, right):
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.0)) as (left, right):
     uem.plot_scene(block.problem, right, field=block.T, label="T / K")
     depth, found = (np.concatenate(comm.allgather(part)) for part in (x, T))
     if left:

@@ -192,7 +192,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(6.0, 4.2)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.2)) as (left, right):
         if left:
             line = np.linspace(-1, 1, 801)
             shown = sorted({max(n // 2 - 1, 0), n - 1, n + n // 2 - 1, 2 * n - 1, 3 * n - 1})
@@ -200,7 +200,14 @@ if args.plot:
                 part, last, a, bound, x, q = profiles[k]
                 exact, *_ = mindlin(np.abs(line) * a, a, bound, last, part * limit)
                 left.plot(line, exact, color=colour, lw=1)
-                left.plot(x, q, ".", ms=3, color=colour, label=f"Q = {part * args.part:+.2f} mu P")
+                left.plot(
+                    x,
+                    q,
+                    ".",
+                    ms=3,
+                    color=colour,
+                    label=f"Q = {round(part * args.part, 2) + 0.0:.2f} mu P, {'first loading' if k < n else 'cycle'}",
+                )
             left.set(xlim=(-1.15, 1.15), xlabel="x / a", ylabel="friction / (mu p0), lines: Mindlin")
             if dim == 3:
                 right.plot(
@@ -208,10 +215,12 @@ if args.plot:
                 )
                 right.legend(frameon=False)
             right.plot([0, *way], [0, *(row["Q/(mu P)"] for row in rows)], ".-", ms=3, lw=0.8)
-            right.set(xlabel="way of the flat side", ylabel="Q / (mu P)")
+            right.set(xlabel="tangential displacement of the flat side", ylabel="Q / (mu P)")
             for ax in (left, right):
                 ax.grid(alpha=0.25)
-            left.legend(frameon=False, fontsize="small", ncol=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+            left.legend(
+                frameon=False, ncol=2, columnspacing=0.8, handletextpad=0.1, loc="lower center", bbox_to_anchor=(0.5, 1.0)
+            )
 
 # %%
 assert results["stick_edge_error"] <= 1 and results["newton_iterations"] <= (5 if dim == 2 else 8), results

@@ -136,7 +136,9 @@ if args.plot and common.draws_3d():
         args.plot,
         field=ufl.sqrt(1.5 * ufl.inner(s, s)),
         label="von Mises stress",
-        levels=10,
+        levels=8,
+        percentiles=(0, 99),
+        triad=False,
         view=(1.0, -0.6, 0.3),
     )
 

@@ -106,7 +106,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(5.2, 4.0)) as panels:
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as panels:
         if panels[0] is not None:
             for k, name in enumerate(names):
                 panels[0].plot(t, found[:, k], color=f"C{k}", label=name.replace("_", " "))

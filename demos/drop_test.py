@@ -129,7 +129,7 @@ common.report(args, results)
 
 # %%
 if args.plot and common.draws_3d():
-    with uem.figure(args.plot, comm, panels=3, size=(4.6, 3.8)) as (left, middle, right):
+    with uem.figure(args.plot, comm, panels=3, size=(3.3, 3.8)) as (left, middle, right):
         uem.plot_scene(problem, left, **look)
         if middle is not None:
             middle.plot(1e3 * t, 1e-3 * force)

@@ -107,14 +107,15 @@ common.report(args, results)
 if args.plot:
     stress = material.stress(u)
     size = ufl.sqrt(ufl.inner(ufl.dev(stress), ufl.dev(stress)))
-    with uem.figure(args.plot, comm, panels=2, size=(9.0, 3.6)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.2)) as (left, right):
         reach, middle = 4.5, args.z1 / 2
         uem.plot_scene(
             problem, left, field=size / args.E, label="deviatoric stress / E", cells=False, levels=np.linspace(0, 2e-3, 11),
             window=(middle - reach, middle + reach, -reach, reach),
         )  # fmt: skip
         if right:
-            for values, line in ((T1, "T1"), (T2 * args.z1 / args.z2, "T2 z1 / z2")):
+            for values, line in ((T1, "driver: T1"), (T2 * args.z1 / args.z2, "driven gear: T2 z1 / z2")):
                 right.plot(pitches, values, "--" if "z" in line else "-", label=line)
-            right.set(xlabel="turn in teeth", ylabel="torque")
-            right.legend()
+            right.set(xlabel="rotation in teeth", ylabel="torque", ylim=(0.0, 1.2 * T1.max()))
+            right.grid(alpha=0.25)
+            right.legend(frameon=False, loc="upper left", ncol=2)

@@ -87,7 +87,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(5.2, 4.0)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as (left, right):
         uem.plot_scene(problem, left, mirror=True)
         if right is not None:
             d, w, path = 0.0, v0, [(0.0, 0.0)]

@@ -124,23 +124,27 @@ if args.plot:
     s = ufl.dev(material.stress(problem.u))
     von_mises = ufl.sqrt(1.5 * ufl.inner(s, s))
     solid = common.draws_3d()
-    with uem.figure(args.plot, comm, panels=3 if solid else 2) as (left, right, *scene):
+    with uem.figure(args.plot, comm, panels=3 if solid else 2) as (*scene, right, left):
         if left is not None:
             cells, percent = [a / r["h"] for r in rows], [100 * abs(r["error"]) for r in rows]
             left.loglog(cells, percent, "o-")
             left.set_xticks(cells, [f"{n:g}" for n in cells])
             left.set_yticks(percent, [f"{e:.2g} %" for e in percent])
             left.minorticks_off()
-            left.set_xlabel("cells per contact radius")
-            left.set_ylabel("error of the force against Hertz")
+            left.set_xlabel("cells over the contact radius")
+            left.set_ylabel("error of the force")
             left.grid(alpha=0.25)
         other = solve(args.h, "mortar" if args.coupling == "node_to_surface" else "node_to_surface")[0]
         uem.plot_pressure([*problem.contacts, *other.contacts], right, window=(0.0, 1.3 * a), reference_label="Hertz",
                           reference=lambda r: p0 * np.sqrt(np.maximum(1 - (r / a) ** 2, 0)))  # fmt: skip
+        if right is not None:
+            # above the curves
+            right.set_ylim(top=1.45 * p0)
+            right.legend(frameon=False, loc="upper right")
         if solid:
             box = a * np.array([0.0, 1.6, 0.0, 1.6, -1.2, 1.2])
-            uem.plot_scene(problem, scene[0], field=von_mises / p0, label="von Mises stress / p0", window=box, levels=10,
-                           cells=False, view=(-1.0, -1.6, 0.5))  # fmt: skip
+            uem.plot_scene(problem, scene[0], field=von_mises / p0, label="von Mises stress / p0", window=box, levels=8,
+                           cells=False, view=(-1.0, -1.2, 0.5))  # fmt: skip
 
 # %%
 errors = [abs(r["error"]) for r in rows]

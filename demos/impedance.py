@@ -109,7 +109,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(5.2, 4.0)) as panels:
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as panels:
         if panels[0] is not None:
             exact = [0.0, meet, meet, meet + lasts, meet + lasts, t[-1]], [0.0, 0.0, force, force, 0.0, 0.0]
             panels[0].plot(*exact, color="0.3", lw=2.5, alpha=0.4, label="characteristics")

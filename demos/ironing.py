@@ -186,7 +186,7 @@ if args.plot:
             for i, label in ((g - 1, "normal force"), (0, "drag")):
                 panels[-1].plot(at[pressed] / pitch, force[pressed, i], label=label)
             panels[-1].axvline((L - begin) / pitch, color="0.6", lw=0.8, label="end of the slab")
-            panels[-1].set(xlabel="way of the tool, in elements", ylabel="force on the tool")
+            panels[-1].set(xlabel="displacement of the tool, in elements", ylabel="force on the tool")
             panels[-1].grid(alpha=0.25)
             panels[-1].legend(frameon=False)
 

@@ -100,7 +100,7 @@ if args.output:
         writer.write(good.steps[-1])
 
 # %%
-with uem.figure(args.plot, comm, panels=2, size=(6.4, 4.4)) as (left, right):
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.4)) as (left, right):
     uem.plot_scene(good.problem, left, mirror=True)
     if right:
         right.plot(reference.s, reference.pressure, "0.5", label="four times as fine")

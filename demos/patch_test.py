@@ -163,7 +163,7 @@ if args.plot or args.output:
     solved = [solve(2, 1, others, passes, coupling=coupling) for coupling, passes in shown.values()]
     if args.plot:
         levels = np.linspace(-1.055, -0.945, 12)
-        with uem.figure(args.plot, comm, panels=3, size=(3.6, 4.8)) as panels:
+        with uem.figure(args.plot, comm, panels=3, size=(3.3, 4.8)) as panels:
             for panel, (problem, stress, error, _), label in zip(panels, solved, shown):
                 uem.plot_scene(problem, panel, field=stress, label="$\\sigma_{yy} / p$", levels=levels, cmap="RdBu_r")
                 if panel is not None:

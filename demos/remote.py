@@ -89,7 +89,7 @@ history, frames = [], []
 for step in uem.time_steps(problem, args.dt, args.end):
     history.append((step.time, wheel.rotation, *contact.resultant().force, *dynamics.momentum()))
     if step.number % max(1, round(args.end / args.dt / 4)) == 1:
-        frames.append(uem.outline(problem))
+        frames.append((step.time, uem.outline(problem)))
     if writer is not None:
         writer.write(step)
 if writer is not None:
@@ -116,18 +116,22 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(4.6, 3.2)) as panels:
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.6)) as panels:
         if panels[0] is not None:
+            from matplotlib import colormaps
             from matplotlib.collections import LineCollection
 
-            for k, lines in enumerate(frames):
-                panels[0].add_collection(LineCollection(lines, colors=[str(0.75 - 0.25 * k)], linewidths=1.2))
+            for k, (time, lines) in enumerate(frames):
+                colour = colormaps["viridis_r"](0.1 + 0.9 * k / len(frames))
+                panels[0].add_collection(LineCollection(lines, colors=[colour], linewidths=1.5, label=f"time {time:.2f}"))
             panels[0].autoscale()
-            panels[0].set(aspect="equal", title="the wheel strikes")
-            panels[1].plot(t, across, label="force on the beam, across")
-            panels[1].plot(t, along, label="along")
-            panels[1].set(xlabel="time", xlim=(0.0, 0.25))
-            panels[1].legend(frameon=False)
+            panels[0].set(aspect="equal", xlabel="x", ylabel="y")
+            panels[0].legend(frameon=False, loc="upper left", bbox_to_anchor=(0.0, 0.98))
+            panels[1].plot(t, across, ".-", ms=4, label="normal to the beam")
+            panels[1].plot(t, along, ".-", ms=4, label="along the beam")
+            panels[1].set(xlabel="time", xlim=(0.0, 0.25), ylabel="contact force on the beam")
+            panels[1].grid(alpha=0.25)
+            panels[1].legend(frameon=False, loc="lower right")
 
 # %%
 assert results["remote_error"] < 1e-10, results

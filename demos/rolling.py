@@ -130,7 +130,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(6.4, 4.0)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as (left, right):
         if left:
             for k, lines in enumerate(curves[1][3]):
                 left.plot(*lines.transpose(2, 1, 0), color="C1", lw=1.0, alpha=0.25 + 0.75 * (k + 1) / len(curves[1][3]))

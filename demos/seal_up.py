@@ -103,7 +103,7 @@ if args.output:
         writer.write(good.steps[-1])
 
 # %%
-with uem.figure(args.plot, comm, panels=2, size=(6.8, 3.6)) as (left, right):
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.6)) as (left, right):
     uem.plot_scene(good.problem, left, field=ufl.split(good.problem.u)[1], label="p / E", mirror=True)
     for name, seal in (("four times as fine, displacements", reference), ("displacement and pressure, nu = 0.5", good)):
         at = [np.concatenate(comm.allgather(part)) for part in (seal.plate.points[:, 0], seal.plate.pressures)]

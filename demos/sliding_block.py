@@ -154,13 +154,13 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(6.4, 4.0)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as (left, right):
         s = uem.LinearElastic(args.E, nu, kind="plane_strain").stress(problem.u)
         uem.plot_scene(problem, left, field=s[0, 1], label="shear stress", scale=5.0)
         if right:
             for (mu, rigid), curve in curves.items():
                 right.plot(*curve.T[:2], ("-", "--")[not rigid], label=f"mu {mu}, {'rigid' if rigid else 'elastic'} base")
-            right.set(xlabel="way of the tail", ylabel="H / (mu N)")
+            right.set(xlabel="displacement of the tail", ylabel="H / (mu N)")
             right.grid(alpha=0.25)
             right.legend(frameon=False)
 

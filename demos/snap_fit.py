@@ -126,13 +126,13 @@ common.report(args, results)
 # %%
 how = {"field": abs(even), "label": "relative stress", "levels": np.linspace(0.0, 1.0, 11), "cells": False, "arrows": False}
 if args.plot:
-    with uem.figure(args.plot, comm, panels=3, size=(5.2, 2.2)) as panels:
+    with uem.figure(args.plot, comm, panels=3, size=(6.4, 2.4), columns=1) as panels:
         for panel, thickness in zip(panels, (constant, found.x)):
-            uem.plot_scene(insert(thickness), panel, **how)
+            uem.plot_scene(insert(thickness), panel, window=(-0.6, 1.23 * L, -2.9, 3.0), **how)
         if panels[2] is not None:
             panels[2].plot(knots, closed, "k-", lw=1, label="beam theory")
-            panels[2].plot(knots, found.x, "x", label="found")
-            panels[2].set(xlabel="x", ylabel="thickness", ylim=(0.0, 1.3 * H))
+            panels[2].plot(knots, found.x, "x", label="optimised")
+            panels[2].set(xlabel="x", ylabel="thickness", xlim=(-0.6, 1.23 * L), ylim=(0.0, 1.3 * H))
             panels[2].legend()
 if args.output:
     film = f"{args.output}/snap_fit.gif"

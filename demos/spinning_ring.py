@@ -124,7 +124,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(6.4, 3.8)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.8)) as (left, right):
         if left:
             for row, (mu, frames) in enumerate(pictures.items()):
                 for k, lines in enumerate(frames):

@@ -169,7 +169,7 @@ if args.plot:
                 spine.set_visible(False)
     path = Path(args.plot)
     beside = path.with_name(f"{path.stem}_condition{path.suffix}")
-    with uem.figure(beside if curves else None, comm, panels=3, size=(4.6, 3.9)) as panels:
+    with uem.figure(beside if curves else None, comm, panels=3, size=(3.3, 3.9)) as panels:
         if panels[0] is not None:
             labels = {
                 "ratio": "upper over lower Young's modulus",

@@ -154,17 +154,17 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(4.6, 4.2)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.4)) as (left, right):
         if left is not None:
             left.plot([0, R, R, 0], [0, 0, L, L], "0.6", lw=1, label="before")
             left.plot([0, -R, -R, 0], [0, 0, L, L], "0.6", lw=1)
-            left.plot(-shape[:, 0], shape[:, 1], label="by contact")
-            left.plot(*flat.T, label="foot held")
+            left.plot(-shape[:, 0], shape[:, 1], label="contact")
+            left.plot(*flat.T, label="no lift-off")
             left.plot([-PUBLISHED["foot"], PUBLISHED["foot"]], [0.0, 0.0], "k|", ms=12)
             left.plot(0.0, PUBLISHED["length"], "k_", ms=12, label="published")
-            left.set(xlabel="radius in mm", ylabel="height in mm", aspect="equal", xlim=(-9, 20))
+            left.set(xlabel="radius in mm", ylabel="height in mm", aspect="equal", xlim=(-9, 9))
             left.grid(alpha=0.25)
-            left.legend(frameon=False)
+            left.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
         book.plot(right)
 
 # %%

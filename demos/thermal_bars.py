@@ -143,7 +143,7 @@ common.report(args, results)
 # Temperatures on both sides of the gap, and the flux, as the hot end gets hotter.
 
 # %%
-with uem.figure(args.plot, comm, panels=2, size=(7.0, 3.2)) as (left, right):
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.2)) as (left, right):
     if left:
         at, fine = [row["T"] for row in rows], np.linspace(0.0, hot, 200)
         left.plot(at, [own for own, _ in known], "o", label="upper bar")

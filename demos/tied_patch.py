@@ -114,7 +114,8 @@ if args.plot:
     material, x = uem.LinearElastic(E, nu, kind="plane_stress"), ufl.SpatialCoordinate(tied.u.function_space.mesh)
     bending = material.stress(tied.u)[0, 0] / (6 * args.load * length)
     with uem.figure(args.plot, comm) as (panel,):
-        uem.plot_scene(tied, panel, field=bending, label="bending stress / (6 P l)", levels=np.linspace(-1, 1, 17), arrows=False)
+        uem.plot_scene(tied, panel, field=bending, label="bending stress / (6 P l)", levels=np.linspace(-0.8, 0.8, 17), arrows=False,
+                       cmap="coolwarm")  # fmt: skip
 if args.output:
     with uem.ResultsWriter(f"{args.output}/tied_patch", tied) as writer:
         writer.write(1.0)

@@ -115,7 +115,7 @@ how["levels"] = np.linspace(0.0, 1.0, 6)
 if args.output:
     steps = uem.animate(f"{args.output}/topology.gif", problem, steps, every=2, size=(7.2, 2.4), **how)
 *_, (x, lying) = steps
-with uem.figure(args.plot, comm, panels=2, size=(6.4, 2.2)) as panels:
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 2.2)) as panels:
     uem.plot_scene(problem, panels[1], **how)
     released = load(problem, x_held)
     uem.plot_scene(problem, panels[0], **how)

@@ -5,7 +5,7 @@ mpirun -n 2 python3 demos/tyre.py --plot tyre.png
 Options:
     n: number of cells in every direction, as a multiple of those in the mesh file
     steps: load steps
-    d: way of the rim towards the road, relative to the thickness of the tyre
+    d: displacement of the rim towards the road, relative to the thickness of the tyre
     film: name of a film of the load steps
 """
 
@@ -109,7 +109,7 @@ if args.output:
     with uem.ResultsWriter(f"{args.output}/tyre", problem) as writer:
         writer.write(1.0)
 if args.plot and common.draws_3d():
-    with uem.figure(args.plot, comm, panels=3, size=(5.4, 4.4)) as (left, middle, right):
+    with uem.figure(args.plot, comm, panels=3, size=(3.3, 3.6)) as (left, middle, right):
         uem.plot_scene(problem, left, **look)
         uem.plot_scene(
             problem, middle, field=contact, label="contact pressure / Pa", surface=tags["tread"], view=(0.0, -0.05, -1.0), rigid=False,
@@ -117,7 +117,7 @@ if args.plot and common.draws_3d():
         )  # fmt: skip
         if right is not None:
             right.plot(1e3 * d, 1e-3 * force, "o-", ms=4)
-            right.set(xlabel="way of the rim / mm", ylabel="force / kN")
+            right.set(xlabel="displacement of the rim / mm", ylabel="force / kN")
             right.grid(alpha=0.25)
 
 # %%

@@ -140,7 +140,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(5.6, 3.6)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.6)) as (left, right):
         uem.plot_scene(problem, left, field=peeq, label="equivalent plastic strain", mirror=True, arrows=False)
         if right is not None:
             reductions = np.linspace(0.0, args.reduction, 100)

@@ -135,7 +135,7 @@ common.report(args, results)
 
 # %%
 if args.plot:
-    with uem.figure(args.plot, comm, panels=2, size=(5.2, 4.0)) as (left, right):
+    with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as (left, right):
         uem.plot_scene(problem, left, window=(-1.5 * worn, 1.5 * worn, -0.4 * worn, 2.2 * worn), mirror=True)
         if right:
             order = np.argsort(place)

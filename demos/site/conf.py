@@ -109,6 +109,13 @@ def with_description(app, page, template, context, doctree) -> None:
     )
 
 
+def with_first_panels(app, doctree, page: str) -> None:
+    """A card of the gallery shows the first panel of its picture."""
+    for image in doctree.findall(nodes.image) if page == "README" else ():
+        if "sd-card-img-top" in image["classes"]:
+            image["uri"] = reading.first_panel(Path(app.srcdir) / image["uri"], Path(app.outdir))
+
+
 def with_late_pictures(app, doctree, page: str) -> None:
     """A browser loads the pictures of a page, except the first one, when the reader comes near them."""
     for image in list(doctree.findall(nodes.image))[1:]:
@@ -124,6 +131,7 @@ def with_notebooks(app, error) -> None:
 def setup(app):
     """Formulas as MathML, which browsers draw themselves."""
     app.connect("html-page-context", with_description)
+    app.connect("doctree-resolved", with_first_panels)
     app.connect("doctree-resolved", with_late_pictures)
     app.connect("build-finished", with_notebooks)
     app.connect("source-read", with_pages)

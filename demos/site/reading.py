@@ -14,6 +14,7 @@ import jupytext
 import latex2mathml.converter
 from docutils import nodes
 from nbformat import NotebookNode
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
@@ -109,6 +110,19 @@ def cards() -> str:
         parts.append(f"## {title}\n\n{about}\n\n::::{{grid}} 1 2 2 3\n:gutter: 3\n\n{inside}::::\n")
         parts.append(f"```{{toctree}}\n:hidden:\n\n{pages}\n```\n")
     return "\n".join(parts)
+
+
+def first_panel(picture: Path, folder: Path) -> str:
+    """Write the first panel of a picture, which ``uem.figure`` has noted in it, into a folder; its path in there."""
+    image = Image.open(picture)
+    if panels := image.info.get("Panels", "").split():
+        left, top, right, bottom = (int(number) for number in panels[0].split(","))
+        image = image.crop((max(0, left - 8), max(0, top - 8), min(image.width, right + 8), min(image.height, bottom + 8)))
+    image.thumbnail((640, 640))
+    path = f"_images/cards/{picture.name}"
+    (folder / path).parent.mkdir(parents=True, exist_ok=True)
+    image.save(folder / path, optimize=True)
+    return path
 
 
 def chapters(text: str) -> str:

@@ -21,7 +21,7 @@ from helpers import raised, refused
 from results_scenes import pressed
 
 import uem_dolfinx as uem
-from uem_dolfinx.output import drawings, films, pictures3d, sections
+from uem_dolfinx.output import drawings, films, pictures, pictures3d, sections
 from uem_dolfinx.output import frames as frames_module
 
 pytest.importorskip("matplotlib")
@@ -324,3 +324,57 @@ def test_films_that_are_refused(folder, monkeypatch):
         (folder / "out").write_text("in the way")
     COMM.barrier()
     refused(uem.OutputError, "cannot be written", film(Path("out") / "a.gif"))
+
+
+def test_panels_and_their_letters(folder):
+    """A picture is no wider than a page, and notes where its panels are; they do not overlap and hold all that is drawn."""
+    pytest.importorskip("PIL")
+    from PIL import Image
+
+    for count, columns in ((1, None), (2, None), (3, None), (3, 2), (2, 1)):
+        path = folder / f"panels_{count}_{columns}.png"
+        with uem.figure(path, COMM, panels=count, columns=columns) as panels:
+            for panel in panels:
+                if panel is not None:
+                    panel.set(xlabel="time", ylabel="force")
+        if COMM.rank == 0:
+            image = Image.open(path)
+            assert image.width <= 150 * (pictures.PAGE + 2 * pictures.MARGIN)
+            boxes = np.array([[int(end) for end in one.split(",")] for one in image.info["Panels"].split()])
+            assert len(boxes) == count and (boxes[:, :2] < boxes[:, 2:]).all()
+            ink, held = np.array(image.convert("L")) < 128, np.zeros((image.height, image.width), dtype=int)
+            for left, top, right, bottom in boxes:
+                held[top - 2 : bottom + 2, left - 2 : right + 2] += 1
+            assert held.max() == 1 and (held[ink] == 1).all()
+    raised(uem.InputError, "columns", lambda: uem.figure(folder / "a.png", COMM, columns=0).__enter__())
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_colour_bars_are_as_long_as_the_scene(folder, wide):
+    """To the right of a scene, above it if it is flat, although the panel has another shape."""
+    problem = pressed(COMM, "triangle")
+    window = (-5.0, 5.0, 0.0, 2.0) if wide else (0.0, 0.5, 0.0, 2.0)
+    with uem.figure(folder / "bar.png", COMM, size=(5.0, 4.0)) as (panel,):
+        uem.plot_scene(problem, panel, window=window)
+        if panel is not None:
+            panel.figure.draw_without_rendering()
+            scene, bar = panel.get_window_extent(), panel.child_axes[0].get_window_extent()
+            assert (bar.width if wide else bar.height) == pytest.approx(scene.width if wide else scene.height)
+            assert bar.y0 > scene.y1 if wide else bar.x0 > scene.x1
+
+
+def test_cells_larger_than_the_window_have_their_colour(folder):
+    """All of a window is coloured, although the values at its only vertex are no more than one."""
+    problem = pressed(COMM, "triangle")
+    every = np.concatenate(COMM.allgather(problem.config.X))
+    x, y = every[np.linalg.norm(every - [0.5, 0.5], axis=1).argmin()]
+    across = ufl.SpatialCoordinate(problem.config.mesh)[0]
+    with uem.figure(folder / "near.png", COMM) as (panel,):
+        window = (x - 0.05, x + 0.05, y - 0.05, y + 0.05)
+        uem.plot_scene(problem, panel, field=across, window=window, cells=False, arrows=False)
+        if panel is not None:
+            panel.figure.canvas.draw()
+            box = panel.get_window_extent()
+            pixels = np.asarray(panel.figure.canvas.buffer_rgba())[::-1]
+            inner = pixels[int(box.y0) + 5 : int(box.y1) - 5, int(box.x0) + 5 : int(box.x1) - 5, :3]
+            assert (inner.min(axis=2) < 250).all()

@@ -30,6 +30,10 @@ from uem_dolfinx.solve.problem import UnitedProblem
 EVEN = 1e-9
 #: Colours of surfaces without contact pressure, and of rigid surfaces.
 NO_PRESSURE, RIGID = "#d2d2d2", "#b2b2b2"
+#: Scenes that are wider than this have their colour bar above. [format; height of the scene; -]
+BAR_ABOVE = 1.8
+#: Colour of contact forces, which viridis does not have.
+FORCE = "#d62728"
 FIELD = "a scalar expression, a contact or several, or None for the size of the displacement"
 
 
@@ -147,7 +151,7 @@ class Drawn(ABC):
             self.box = self.box + np.minimum(0.06 * sides.max(), 0.25 * sides) * np.array([-1.0, 1.0])
         # sides of bodies at the limits of the window are visible, in spite of rounding
         self.box = self.box + EVEN * np.diff(self.box, axis=1) * np.array([-1.0, 1.0])
-        seen = np.concatenate([f.values[self._shown(f.x)] for f in frames])
+        seen = np.concatenate([f.values[self._visible(f.x)] for f in frames])
         if not len(seen):
             seen = np.concatenate([f.values for f in frames])
         least, most = float(seen.min()), float(seen.max())
@@ -175,6 +179,10 @@ class Drawn(ABC):
     def _shown(self, x: Array) -> Array:
         """Mask of points in the window."""
         return np.asarray(((x >= self.box[:, 0]) & (x <= self.box[:, 1])).all(axis=1))
+
+    def _visible(self, x: Array) -> Array:
+        """Mask of vertices whose values have colours in the window."""
+        return self._shown(x)
 
     def _arrows(self, frame: Frame) -> tuple[Array, Array]:
         """Contact forces per tributary area: positions and arrows ``(n, gdim)``; the longest is an eighth of the picture."""
@@ -230,6 +238,15 @@ class Drawn2D(Drawn):
     def _shown(self, x: Array) -> Array:
         return np.any([super(Drawn2D, self)._shown(x * [side, 1.0]) for side in self.sides], axis=0)
 
+    def _visible(self, x: Array) -> Array:
+        # also of cells that reach into the window with none of their vertices
+        seen = np.zeros(len(x), dtype=bool)
+        for side in self.sides:
+            corners = (x * [side, 1.0])[self.pieces.faces]
+            inside = (corners.max(axis=1) >= self.box[:, 0]) & (corners.min(axis=1) <= self.box[:, 1])
+            seen[self.pieces.faces[inside.all(axis=1)]] = True
+        return seen
+
     def draw(self, ax: Any, frame: Frame) -> None:
         """Draw a frame into a panel."""
         from matplotlib.collections import LineCollection
@@ -242,20 +259,33 @@ class Drawn2D(Drawn):
             )
             if how.cells:
                 ax.add_collection(LineCollection(x[self.pieces.edges], colors="k", linewidths=0.25, alpha=0.35))
-        ax.figure.colorbar(coloured, ax=ax, label=how.label, shrink=0.85)
+        add_colour_bar(ax, coloured, how.label, float(np.divide(*np.diff(self.box, axis=1).ravel())))
         self._draw_rigid(ax, frame)
         ax.set(xlim=self.box[0], ylim=self.box[1], aspect="equal", xlabel="x", ylabel="y")
         at, arrows = self._arrows(frame)
         for side in self.sides if len(at) else ():
             ax.quiver(
                 *(at * [side, 1.0]).T, *(arrows * [side, 1.0]).T, angles="xy", scale_units="xy", scale=1.0,
-                color="w", edgecolor="k", linewidth=0.4, width=0.005, zorder=3,
+                color=FORCE, edgecolor="w", linewidth=0.4, units="inches", width=0.03, zorder=3,
             )  # fmt: skip
 
     def _draw_rigid(self, ax: Any, frame: Frame) -> None:
         """Rigid targets, hatched behind their surface."""
         for shape in frame.rigid:
             draw_rigid(ax, shape, self.box, self.how.mirror)
+
+
+def add_colour_bar(ax: Any, colours: Any, label: str, aspect: float, **how: Any) -> None:
+    """A colour bar as long as a scene whose width is ``aspect`` times its height: to its right, or above a scene that is flat."""
+    if aspect > BAR_ABOVE:
+        # the same thickness as to the right, relative to the scene's height
+        inset = ax.inset_axes((0.0, 1.0 + 0.03 * aspect, 1.0, 0.03 * aspect))
+        ax.figure.colorbar(colours, cax=inset, label=label, orientation="horizontal", **how)
+        inset.xaxis.set_ticks_position("top")
+        inset.xaxis.set_label_position("top")
+    else:
+        thick = 0.035 * max(1.0, 1.0 / aspect)
+        ax.figure.colorbar(colours, cax=ax.inset_axes((1.0 + 0.8 * thick, 0.0, thick, 1.0)), label=label, **how)
 
 
 def draw_rigid(ax: Any, shape: Shape, box: Array, mirror: bool = False, **line: Any) -> None:
@@ -297,17 +327,24 @@ class Drawn3D(Drawn):
 
     def draw(self, ax: Any, frame: Frame) -> None:
         """Draw a frame into a panel."""
-        ax.imshow(self.images[id(frame)])
+        image = self.images[id(frame)]
+        ax.imshow(image)
         ax.axis("off")
-        ax.figure.colorbar(self.colours, ax=ax, label=self.how.label, shrink=0.85, extend=self.extend, spacing="proportional")
+        add_colour_bar(
+            ax, self.colours, self.how.label, image.shape[1] / image.shape[0], extend=self.extend, spacing="proportional"
+        )
         if self.how.triad:
-            draw_triad(ax, self.how.view)
+            draw_triad(ax, self.how.view, image.shape[1] / image.shape[0])
 
 
-def draw_triad(ax: Any, view: Array) -> None:
-    """The axes of the scene as the eye sees them, in a corner of the panel."""
+def draw_triad(ax: Any, view: Array, aspect: float) -> None:
+    """The axes of the scene as the eye sees them, at the lower left of a panel whose width is ``aspect`` times its height."""
     right, up = pictures3d.screen(view)
-    inset = ax.inset_axes((-0.06, -0.06, 0.16, 0.16))
+    # as large in small and narrow panels as in others
+    extent, inch = ax.get_window_extent(), ax.figure.dpi
+    wide = 0.7 * inch / min(extent.width, aspect * extent.height)
+    high = aspect * wide
+    inset = ax.inset_axes((-0.4 * wide, -0.4 * high, wide, high))
     for name, axis in zip("xyz", np.eye(3)):
         to = np.array([axis @ right, axis @ up])
         inset.annotate("", to, (0.0, 0.0), arrowprops={"arrowstyle": "-|>", "lw": 1.0, "color": "k", "shrinkA": 0, "shrinkB": 0})

@@ -25,6 +25,11 @@ from uem_dolfinx.output.frames import gather_contactors
 from uem_dolfinx.parallel import agreed, ask
 from uem_dolfinx.solve.problem import UnitedProblem
 
+#: Width of a picture of several panels: on a page 736 pixels wide letters of 10 points have 10. [format; inches; -]
+PAGE = 10.0
+#: Margin of a picture. [format; inches; -]
+MARGIN = 0.1
+
 
 class Picture:
     """A picture in memory: Jupyter shows it if it is the value of a cell.
@@ -62,16 +67,24 @@ def _check_ending(path: str | Path, known: Sequence[str]) -> None:
 
 @contextmanager
 def figure(
-    path: str | Path | BinaryIO | None, comm: MPI.Comm, panels: int = 1, size: tuple[float, float] = (6.4, 4.8), dpi: float = 150
+    path: str | Path | BinaryIO | None,
+    comm: MPI.Comm,
+    panels: int = 1,
+    size: tuple[float, float] | None = None,
+    dpi: float = 150,
+    columns: int | None = None,
 ) -> Iterator[list[Any]]:
-    """Canvas with panels side by side, saved at the end; the backend of matplotlib is not changed (collective).
+    """Canvas with panels in rows, saved at the end; the backend of matplotlib is not changed (collective).
 
     Args:
         path: name of the picture, whose folder is made, or an open file. None draws nothing.
         comm: communicator; data are gathered to rank 0, which draws.
         panels: number of panels.
-        size: width and height of a panel in inches.
+        size: width and height of a panel in inches. None is (6.4, 4.8), or less for several panels, so that letters of 10 points
+            are legible where the whole picture is as wide as a page.
         dpi: points of the picture per inch; ``.pdf`` and ``.svg`` have vector graphics instead, except for images of 3D scenes.
+            The text ``Panels`` of a ``.png`` has the corners of each panel, for programs that cut the picture into panels.
+        columns: number of panels in a row; None puts all side by side.
 
     Yields:
         The panels: matplotlib Axes on rank 0, None elsewhere. Pass them to :func:`plot_scene` and :func:`plot_pressure`.
@@ -84,10 +97,12 @@ def figure(
     """
     with agreed(comm):
         drawn = path is not None and comm.rank == 0
-        width, height = checked_size(size)
         dpi = given.number("dpi", dpi, given.POSITIVE)
         panels = given.count("panels", panels)
-        canvas = new_canvas(f"the picture {path}", (panels * width, height)) if drawn else None
+        columns = panels if columns is None else min(panels, given.count("columns", columns))
+        rows, share = -(-panels // columns), PAGE / columns
+        width, height = checked_size((min(6.4, share), min(4.8, 1.2 + 0.55 * share)) if size is None else size)
+        canvas = new_canvas(f"the picture {path}", (columns * width, rows * height)) if drawn else None
         if canvas is not None and isinstance(path, (str, Path)):
             _check_ending(path, list(canvas.canvas.get_supported_filetypes()))
     with agreed(comm):
@@ -95,13 +110,29 @@ def figure(
             yield [None] * panels
             return
         canvas.set_dpi(dpi)
-        yield list(np.atleast_1d(canvas.subplots(1, panels)))
+        axes = list(canvas.subplots(rows, columns, squeeze=False).ravel())
+        while len(axes) > panels:
+            axes.pop().remove()
+        yield axes
         try:
             if isinstance(path, (str, Path)):
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
-            canvas.savefig(path, format=None if isinstance(path, (str, Path)) else "png", dpi=dpi, bbox_inches="tight")
+            kind = None if isinstance(path, (str, Path)) else "png"
+            png = kind or Path(str(path)).suffix.lower() in ("", ".png")
+            text = {"Panels": _corners(canvas, axes, dpi)} if png else None
+            canvas.savefig(path, format=kind, dpi=dpi, bbox_inches="tight", pad_inches=MARGIN, metadata=text)
         except OSError as error:
             raise OutputError(f"the picture {path} cannot be written ({error}): {REMEDY}") from error
+
+
+def _corners(canvas: Any, axes: list[Any], dpi: float) -> str:
+    """The panels with their labels in the saved picture: ``left,top,right,bottom`` in points from its upper left corner."""
+    canvas.draw_without_rendering()
+    whole, inches = canvas.get_tightbbox(), canvas.dpi_scale_trans.inverted()
+    boxes = [ax.get_tightbbox().transformed(inches) for ax in axes]
+    left, top = whole.x0 - MARGIN, whole.y1 + MARGIN
+    ends = np.array([(box.x0 - left, top - box.y1, box.x1 - left, top - box.y0) for box in boxes])
+    return " ".join(",".join(map(str, one)) for one in np.rint(dpi * ends).astype(int))
 
 
 @contextmanager

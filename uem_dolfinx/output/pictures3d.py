@@ -147,7 +147,7 @@ def _image(faces: Ints, solid: Solid, look: Look) -> Array:
     at, to = solid.arrows
     shown = ((at >= look.box[:, 0]) & (at <= look.box[:, 1])).all(axis=1)
     if shown.any():
-        plotter.add_arrows(at[shown], to[shown], color="white", show_edges=True, edge_color="gray", line_width=line)
+        plotter.add_arrows(at[shown], to[shown], color="#d62728")
     return taken(plotter, look.view, look.box)
 
 

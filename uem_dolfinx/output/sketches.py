@@ -277,7 +277,7 @@ def draw_3d(ax: Any, found: Declared, look: Look) -> Sketch:
     ax.imshow(image)
     ax.axis("off")
     if look.triad:
-        draw_triad(ax, look.view)
+        draw_triad(ax, look.view, image.shape[1] / image.shape[0])
     sketch.legend(ax, image.shape[1] < 1.4 * image.shape[0])
     return sketch
 
