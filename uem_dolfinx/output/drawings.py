@@ -240,7 +240,7 @@ class Drawn2D(Drawn):
 
     def _visible(self, x: Array) -> Array:
         # also of cells that reach into the window with none of their vertices
-        seen = np.zeros(len(x), dtype=bool)
+        seen = self._shown(x)
         for side in self.sides:
             corners = (x * [side, 1.0])[self.pieces.faces]
             inside = (corners.max(axis=1) >= self.box[:, 0]) & (corners.min(axis=1) <= self.box[:, 1])
