@@ -83,7 +83,7 @@ class ThrownBodyError(FloatingBodyError):
 
 
 class StepAccuracyError(UEMError, RuntimeError):
-    """The error of a time step exceeds the tolerance."""
+    """The error of a time step or load step exceeds the tolerance."""
 
 
 class MassError(UEMError, ValueError):

@@ -8,6 +8,7 @@ from __future__ import annotations
 from mpi4py import MPI
 
 import numpy as np
+import pytest
 from bar_scenes import Bar
 from helpers import refused
 
@@ -80,3 +81,26 @@ def test_what_is_refused():
     refused(
         uem.StepAccuracyError, ["tolerance", "no better"], lambda: list(uem.time_steps(bar.problem, 0.1, 1.0, tolerance=1e-13))
     )
+
+
+def thrown(dt, tolerance=None):
+    """Displacements and lengths of the steps of a bar that falls, hits a wall and flies back, with its instants."""
+    bar = Bar(10, scheme=uem.generalised_alpha(0.5))
+    times = bar.run(dt, 1.8, tolerance=tolerance, event_tolerance=1e-2)[:, 0]
+    return np.array(bar.u.x.array), np.array([step.dt for step in bar.steps]), times
+
+
+@pytest.mark.slow
+def test_an_impact():
+    """In free flight steps have the length that was given, from the blow on they are short: fewer than equal ones of the same error."""
+    exact, _, _ = thrown(0.002)
+    errors = []
+    for tolerance in (3e-2, 1e-2):
+        u, lengths, times = thrown(0.1, tolerance)
+        assert np.allclose(lengths[times < 0.45], 0.1) and lengths[times > 0.55].max() < 0.03
+        equal, count, _ = thrown(1.8 / len(lengths))
+        assert len(count) >= len(lengths)
+        found = [COMM.allreduce(np.abs(x - exact).max(initial=0.0), op=MPI.MAX) for x in (u, equal)]
+        assert found[0] < 0.8 * found[1]
+        errors.append(found[0])
+    assert errors[1] < 0.5 * errors[0]

@@ -77,14 +77,15 @@ class StepControl:
         """After a final failure, reset the length to its value before the failed step."""
         self.longest = self._longest_before
 
-    def done(self, iterations: Sequence[object], longer: bool = True) -> tuple[int, int]:
+    def done(self, iterations: Sequence[object], longer: bool = True, loops: int = 1) -> tuple[int, int]:
         """Count a step that converged with this history; returns its number and the number of its cuts.
 
         Args:
             iterations: the history.
             longer: whether the next step may be longer if this one was easy.
+            loops: number of Newton loops in the history.
         """
-        if len(iterations) - 1 <= EASY and longer:
+        if len(iterations) - 1 <= EASY * loops and longer:
             self.longest *= 2.0
         self._longest_before = self.longest
         cuts, self._cuts, self.number = self._cuts, 0, self.number + 1

@@ -155,6 +155,8 @@ class AlongArc:
     Attributes:
         tried: intended length of the last step, relative to the arc of all nominal steps.
         most: largest number of steps relative to the nominal one, before the path is given up.
+        longer: whether the next step may be longer if this one was easy.
+        loops: number of Newton loops that make a step.
     """
 
     def __init__(self, problem: UnitedProblem):
@@ -169,7 +171,7 @@ class AlongArc:
         if not problem.config.moves:
             refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out")
         self._problem, self._arc = problem, ArcLength(problem)
-        self.tried, self.most = 0.0, MOST_STEPS
+        self.tried, self.most, self.longer, self.loops = 0.0, MOST_STEPS, True, 1
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
         """Take a step from the committed load factor ``done`` and commit it (collective).

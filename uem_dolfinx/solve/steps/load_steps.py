@@ -6,21 +6,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from uem_dolfinx import given
 from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
-from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.memory import take_back
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.step_control import REMAINDER, StepControl
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
+from uem_dolfinx.solve.steps.by_error import ByError
+from uem_dolfinx.solve.steps.by_load import ByLoad
 from uem_dolfinx.solve.steps.limit_points import LimitPoint
 from uem_dolfinx.solve.steps.load_step import LoadStep
-from uem_dolfinx.solve.united.newton import Iteration
 
 if TYPE_CHECKING:
     from uem_dolfinx.restart.checkpoint import Checkpoint
@@ -29,7 +26,12 @@ if TYPE_CHECKING:
 
 
 def load_steps(
-    problem: UnitedProblem, steps: int | Sequence[Step] = 1, *, arc_length: bool = False, checkpoint: Checkpoint | None = None
+    problem: UnitedProblem,
+    steps: int | Sequence[Step] = 1,
+    *,
+    arc_length: bool = False,
+    tolerance: float | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Iterator[LoadStep]:
     """Apply the load in steps, cut on failure and increased again after easy steps, up to the nominal length, with a progress bar.
 
@@ -39,6 +41,8 @@ def load_steps(
             its own number, between which conditions, loads, contacts and coefficients change: the load factor runs from 0 to 1 in each.
         arc_length: prescribe the load of the first step only, and its length in displacement for all other steps. The load factor is an
             unknown, which increases up to limit points and decreases beyond them, until it is 1. Dirichlet values are not ramped.
+        tolerance: shorten steps until what they change differs by less than this part from two steps of half the length, which count;
+            and lengthen them where they allow it. So histories of friction and plasticity have about this error. None: no such test.
         checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
             in ``checkpoint.begin(problem.state())``, which writers with ``resume=True`` need. On restart, calls of ``load_steps``
             that the checkpoint has already passed yield no steps.
@@ -48,10 +52,12 @@ def load_steps(
 
     Raises:
         InputError, InputTypeError: if ``steps`` is neither a positive whole number nor a list of ``Step``, or if a step is not of this
-            problem; with ``arc_length`` if no load moves the bodies, if Dirichlet values do, or for a list of ``Step``.
+            problem; with ``arc_length`` if no load moves the bodies, if Dirichlet values do, for a list of ``Step``, or with
+            ``tolerance``; with ``tolerance`` while the problem is recorded.
         CheckpointError: see ``Checkpoint``.
         ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: if a step fails even at 1/1024 of its
             nominal length; the last converged state is kept.
+        StepAccuracyError: if the error exceeds the tolerance even in the shortest step.
         KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM; the last converged state is kept.
     """
     check_steps(problem, checkpoint)
@@ -62,17 +68,24 @@ def load_steps(
             raise InputError(
                 "arc_length = True does not go with a list of Step: follow a path by load_steps(problem, n, arc_length=True)"
             )
+        tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))
+        if arc_length and tolerance is not None:
+            raise InputError(
+                "tolerance does not go with arc_length = True, where half a step ends elsewhere: leave one of them out"
+            )
+        if problem.history is not None and tolerance is not None:
+            raise InputError("the problem is being recorded: leave tolerance out, and take as many steps as a run with it took")
         n = 0 if several else given.count("steps", steps, "or give a list of Step")
-    given.alike(problem.comm, "load_steps", steps=n, arc_length=arc_length)
+    given.alike(problem.comm, "load_steps", steps=n, arc_length=arc_length, tolerance=tolerance)
     if isinstance(steps, Sequence):
         from uem_dolfinx.solve.steps.stages import check_stages
 
         check_stages(problem, steps)
     begin_checkpoint(checkpoint, problem.state, problem.config.functions()[problem.config.name])
     if isinstance(steps, Sequence):
-        made, total = _in_stages(problem, steps), sum(step.n for step in steps)
+        made, total = _in_stages(problem, steps, tolerance), sum(step.n for step in steps)
     else:
-        way: ByLoad | AlongArc = ByLoad(problem)
+        way: ByLoad | AlongArc = _by_load(problem, tolerance)
         if arc_length:
             from uem_dolfinx.solve.steps.arc_length import AlongArc
 
@@ -83,7 +96,7 @@ def load_steps(
     )
 
 
-def _in_stages(problem: UnitedProblem, steps: Sequence[Step]) -> Iterator[LoadStep]:
+def _in_stages(problem: UnitedProblem, steps: Sequence[Step], tolerance: float | None) -> Iterator[LoadStep]:
     """The load steps of several ``Step``, or, on restart, up to the load factor at which the earlier run has left them."""
     from uem_dolfinx.solve.steps.stages import Stage
 
@@ -92,7 +105,7 @@ def _in_stages(problem: UnitedProblem, steps: Sequence[Step]) -> Iterator[LoadSt
         left, through = progress.left_at(), False
         stage = Stage(problem, step, 1.0 if left is None else left)
         try:
-            for made in _load_steps(problem, step.n, ByLoad(problem)):
+            for made in _load_steps(problem, step.n, _by_load(problem, tolerance)):
                 yield replace(made, step=step.name, before=progress.ramp - 1)
             through = True
         finally:
@@ -131,49 +144,13 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         progress.factor = factor
         if problem.solver.indefinite:
             unstable = factor
-        number, cuts = progress.control.done(iterations)
+        number, cuts = progress.control.done(iterations, way.longer, way.loops)
         yield LoadStep(number, factor, iterations, cuts)
 
 
-class ByLoad:
-    """Advances a problem by steps of given load.
-
-    Args:
-        problem: the problem.
-
-    Attributes:
-        tried: intended load increment of the last step.
-        most: largest number of steps relative to the nominal one, here unlimited.
-    """
-
-    def __init__(self, problem: UnitedProblem):
-        self._problem, self.tried, self.most = problem, 0.0, np.inf
-        self._ramped = not callable(problem.load) and (problem.stage is None or problem.stage.step.ramp)
-
-    def advance(self, done: float) -> tuple[float, list[Iteration]]:
-        """Take a step from the committed load factor ``done`` and commit it (collective).
-
-        Returns:
-            The load factor and the history of the Newton loop.
-        """
-        progress = self._problem.progress
-        factor = _next_factor(done, progress.control)
-        # it may be shorter than the controlled length
-        self.tried = factor - done
-        if self._problem.verbose:
-            say(f"load step {progress.control.number + 1}, to load factor {factor:.6g}")
-        self._problem.set_load(factor)
-        return factor, self._problem.solve(start=progress.start, fraction=factor if self._ramped else 1.0)
-
-
-def _next_factor(done: float, control: StepControl) -> float:
-    """Load factor at the end of the next step, at most the next multiple of the nominal length."""
-    nominal = control.nominal
-    goal = min((np.floor(done / nominal + REMAINDER) + 1.0) * nominal, 1.0)
-    factor = min(done + control.length, goal)
-    if goal - factor < REMAINDER * nominal:
-        factor = goal
-    return 1.0 if 1.0 - factor < REMAINDER else float(factor)
+def _by_load(problem: UnitedProblem, tolerance: float | None) -> ByLoad:
+    """Steps of given load, with a tolerance for their error or without."""
+    return ByLoad(problem) if tolerance is None else ByError(problem, tolerance)
 
 
 def check_steps(problem: Any, checkpoint: Any) -> None:
