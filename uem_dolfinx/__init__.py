@@ -38,13 +38,13 @@ __version__ = "0.2.0"
 __all__ = [
     "Adaptation", "Adhesion", "Balance", "Ball", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
     "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Deck", "Dynamics", "Elastic",
-    "Energies", "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "Exponential", "FinitePlasticity", "FloatingBodyError",
-    "FrictionError", "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError", "InvertedElementError", "Leak",
-    "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeanMotion", "MeshError", "MissingBackendError",
-    "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError", "OverdeterminedError",
-    "PenetrationError", "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant", "Results",
-    "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme", "Slider",
-    "SoftContact", "SpaceError", "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError",
+    "Energies", "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "ErrorLimit", "Exponential", "FinitePlasticity",
+    "FloatingBodyError", "FrictionError", "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError",
+    "InvertedElementError", "Leak", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeanMotion", "MeshError",
+    "MissingBackendError", "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError",
+    "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant",
+    "Results", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme",
+    "Slider", "SoftContact", "SpaceError", "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError",
     "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
     "UserFunctionError", "Vibrations", "ViscousFriction", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector",
     "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh",
@@ -117,6 +117,7 @@ from uem_dolfinx.solve.steps.load_steps import load_steps
 if _TYPE_CHECKING:
     from uem_dolfinx.accuracy.adapt import Adaptation, adapt
     from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+    from uem_dolfinx.accuracy.limit import ErrorLimit
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
     from uem_dolfinx.conditions.joints import Ball, Hinge, Slider, Spring
@@ -194,7 +195,7 @@ _LATER = {
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "plot_setup": "output.pictures",
     "Adaptation": "accuracy.adapt", "adapt": "accuracy.adapt",
-    "ErrorEstimate": "accuracy.estimate", "error_estimate": "accuracy.estimate",
+    "ErrorEstimate": "accuracy.estimate", "error_estimate": "accuracy.estimate", "ErrorLimit": "accuracy.limit",
     "ContactParameter": "gradients.parameters",
     "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
     "History": "gradients.history", "recording": "gradients.history",

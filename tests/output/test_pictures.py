@@ -126,7 +126,9 @@ def test_colours():
 
     def drawn(**how):
         known = dict(levels=10, window=None, mirror=False, percentiles=None, pressed=False, cmap="viridis")
-        return drawings.Drawn2D(types.SimpleNamespace(**(known | how)), types.SimpleNamespace(faces=np.zeros((0, 3), int)), [frame])
+        return drawings.Drawn2D(
+            types.SimpleNamespace(**(known | how)), types.SimpleNamespace(faces=np.zeros((0, 3), int)), [frame]
+        )
 
     pressed, most = drawn(pressed=True), drawn(percentiles=(0.0, 99.0))
     assert pressed.extend == "min" and 0 < pressed.bounds[0] <= drawings.EVEN * 50.0

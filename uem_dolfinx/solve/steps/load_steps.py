@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ def load_steps(
     *,
     arc_length: bool = False,
     tolerance: float | None = None,
+    estimate: Callable[[UnitedProblem], None] | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Iterator[LoadStep]:
     """Apply the load in steps, cut on failure and increased again after easy steps, up to the nominal length, with a progress bar.
@@ -43,6 +44,7 @@ def load_steps(
             unknown, which increases up to limit points and decreases beyond them, until it is 1. Dirichlet values are not ramped.
         tolerance: shorten steps until what they change differs by less than this part from two steps of half the length, which count;
             and lengthen them where they allow it. So histories of friction and plasticity have about this error. None: no such test.
+        estimate: called with the problem after every step, as ``ErrorLimit(0.05)``, which warns of errors by the mesh; or None.
         checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier
             in ``checkpoint.begin(problem.state())``, which writers with ``resume=True`` need. On restart, calls of ``load_steps``
             that the checkpoint has already passed yield no steps.
@@ -76,6 +78,7 @@ def load_steps(
         if problem.history is not None and tolerance is not None:
             raise InputError("the problem is being recorded: leave tolerance out, and take as many steps as a run with it took")
         n = 0 if several else given.count("steps", steps, "or give a list of Step")
+    given.kind("estimate", estimate, estimate is None or callable(estimate), "an ErrorLimit, or another function of the problem")
     given.alike(problem.comm, "load_steps", steps=n, arc_length=arc_length, tolerance=tolerance)
     if isinstance(steps, Sequence):
         from uem_dolfinx.solve.steps.stages import check_stages
@@ -91,9 +94,20 @@ def load_steps(
 
             way = AlongArc(problem)
         made, total = _load_steps(problem, steps, way), steps
+    if estimate is not None:
+        made = _estimated(problem, made, estimate)
     return between_steps(
         problem.comm, problem.progress, progress_bar(made, "load steps", total=total), checkpoint, problem.declared
     )
+
+
+def _estimated(
+    problem: UnitedProblem, steps: Iterator[LoadStep], estimate: Callable[[UnitedProblem], None]
+) -> Iterator[LoadStep]:
+    """The steps, after each of which the error is estimated."""
+    for step in steps:
+        estimate(problem)
+        yield step
 
 
 def _in_stages(problem: UnitedProblem, steps: Sequence[Step], tolerance: float | None) -> Iterator[LoadStep]:
