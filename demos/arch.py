@@ -18,8 +18,8 @@ Options:
 # q = E A k^4 \left( \frac{(e - a)\, t^2}{24} + \frac{a\,(e^2 - a^2)}{32} \right).
 # $$
 #
-# From a limit point on the load has to fall, lest the arch jump; where it would rise again, the arch comes upon a floor. With
-# `arc_length=True` the first load step alone is made by its load. All others go as far in displacement, and find the load.
+# Beyond the limit point the load must decrease to follow the equilibrium path; before it increases again, the arch meets a floor. With
+# `arc_length=True` only the first step has a prescribed load. All others have the same displacement length, and the load is found.
 
 # %%
 import common

@@ -15,14 +15,14 @@ Options:
 # %% [markdown]
 # # Gears in mesh
 #
-# Two involute gears of z1 and z2 teeth have their bores turned by theta and `-theta z1 / z2`, after the driver was wound up against the
-# other by a small angle. Rigid involutes touch along one line, which leans from the tangent of the pitch circles by the pressure angle of
-# 20 degrees and has the same distance from both centres but for the factor z2 / z1: without friction `T2 / T1 = z2 / z1` for the torques
-# in every position. Elastic teeth bend, by which the next pair meets too early, at the corner of a tip. There forces leave the line for a
-# moment, the less the smaller the torque is.
+# The bores of two involute gears of z1 and z2 teeth rotate by theta and `-theta z1 / z2`, after a small rotation of the driver against the
+# other gear. Rigid involutes touch along the line of action. Its angle with the tangent of the pitch circles is the pressure angle of 20
+# degrees, and its distances from the two centres have the ratio z2 / z1. So `T2 / T1 = z2 / z1` holds for the torques in every position
+# without friction. Elastic teeth bend, so the next pair meets too early, at the corner of a tip. The contact force then deviates briefly
+# from the line of action, by an amount that decreases with the torque.
 #
-# A tip is a sharp corner. With `node_to_surface` tips of the target are seen by contactors around them alone, and a warning tells how deep
-# one is inside; `mortar` integrates over both. `--contactor` makes either gear the one whose nodes are eliminated.
+# A tip is a sharp corner. With `node_to_surface` a tip of the target may enter a facet between two contactors; a warning states how
+# deep. `mortar` integrates over both surfaces. `--contactor` selects the gear whose nodes are eliminated.
 
 # %%
 import common

@@ -11,11 +11,11 @@ Options:
 # # Remote loads and a rigid flywheel
 #
 # The tip of a beam moves rigidly with a point outside of it, where a force and a moment act. Elements of degree 2 without lateral
-# contraction carry tension and pure bending exactly, so that motions of the point are those of beam theory; under a shear force the
-# rotation is, by reciprocity. With `distribute=True` the tip is not stiffened, and forces and moments still balance at the root.
+# contraction carry tension and pure bending exactly, so that the motions of the point equal those of beam theory. Under a shear force
+# its rotation does, by reciprocity. With `distribute=True` the tip is not stiffened, and forces and moments still balance at the root.
 #
-# Then the beam flies free and a wheel that spins strikes it. The wheel has no stiffness, only the mass of its mesh, and 3 unknowns.
-# What it loses of its momentum the beam has got.
+# Then a spinning wheel strikes the beam, which is free. The wheel has no stiffness, only the mass of its mesh, and 3 unknowns.
+# The beam gains the momentum that the wheel loses.
 
 # %%
 import common
@@ -97,7 +97,7 @@ if writer is not None:
 
 # %% [markdown]
 # ## The figures
-# Nodes of the wheel are where its motion takes the drawing.
+# The nodes of the wheel are compared with its reference shape moved rigidly.
 
 # %%
 t, angle, along, across, *momentum = np.array(history).T

@@ -15,8 +15,8 @@ Options:
 # A solid tyre with four grooves around it, of neo-Hookean rubber, is bonded to a stiff rim that moves down by d. The road is a rigid
 # plane. Half of the tyre's width is modelled; where the ribs touch the road is part of the solution.
 #
-# Two sums tell whether it is right: the force on the rim is the one on the road, and the work of the rim, from the forces at
-# all steps by the trapezoidal rule, is the energy in the rubber, since without friction none is lost.
+# Two balances check the result. The force on the rim equals the force on the road. The work of the rim, by the trapezoidal rule over
+# all steps, equals the energy in the rubber, since nothing dissipates energy without friction.
 
 # %%
 import time
@@ -34,8 +34,8 @@ E, nu, thickness, height = 6e6, 0.45, 0.1, 0.2  # Pa, m
 
 # %% [markdown]
 # ## The scene
-# Rubber hardly changes its volume: what resists that is integrated with one point in every cell. CG goes on while Newton's method has use
-# for more digits, and its preconditioner is algebraic multigrid.
+# Rubber hardly changes its volume: the volumetric part of the stress is integrated with one point in every cell. The CG tolerance follows
+# the Newton residual (inexact Newton), and the preconditioner is algebraic multigrid.
 
 # %%
 mesh, tags = uem.read_gmsh(common.MESHES / "tyre.geo", comm, gdim=3, parameters={"n": args.n})

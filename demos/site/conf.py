@@ -117,9 +117,13 @@ def with_first_panels(app, doctree, page: str) -> None:
 
 
 def with_late_pictures(app, doctree, page: str) -> None:
-    """A browser loads the pictures of a page, except the first one, when the reader comes near them."""
-    for image in list(doctree.findall(nodes.image))[1:]:
+    """A browser loads the pictures of a page, except the first one, when the reader comes near them; wide ones scroll on narrow windows."""
+    images = list(doctree.findall(nodes.image))
+    for image in images[1:]:
         image["loading"] = "lazy"
+    for image in images:
+        if reading.is_wide(Path(app.srcdir) / image["uri"]):
+            image["classes"].append("wide")
 
 
 def with_notebooks(app, error) -> None:

@@ -125,6 +125,14 @@ def first_panel(picture: Path, folder: Path) -> str:
     return path
 
 
+def is_wide(picture: Path) -> bool:
+    """Whether a picture has several panels side by side, whose letters are too small on a narrow window."""
+    if picture.suffix != ".png" or not picture.exists():
+        return False
+    width, height = Image.open(picture).size
+    return width > max(1000, 1.5 * height)
+
+
 def chapters(text: str) -> str:
     """The pages to which the first column of a table leads, for the sidebar."""
     pages = re.findall(r"^\| \[[^]]*\]\((\w+)\.md\)", text, re.MULTILINE)
