@@ -103,5 +103,5 @@ with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.2)) as (left, right):
                 own = [row for row in rows if row["mesh"] == name and row["degree"] == degree]
                 x, y = ([row[key] for row in own] for key in ("cells", "error"))
                 right.loglog(x, y, marker, color=colour, ms=4, label=f"{name}, degree {degree}")
-        right.set(xlabel="number of cells", ylabel="error in the energy norm", ylim=(1e-3, 0.5))
+        right.set(xlabel="number of cells", ylabel="error in the energy norm", ylim=(5e-5, 0.5))
         right.legend(loc="lower left")

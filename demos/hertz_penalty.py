@@ -176,7 +176,7 @@ if args.plot:
                 left.annotate(
                     f"{r['newton_iterations']} its", (r["penalty"], r["overlap"] / d), (4, 6), textcoords="offset points"
                 )
-            left.margins(0.12)
+            left.margins(0.18)
             left.set_xlabel("penalty")
             left.set_title(
                 f"united elements: overlap {figures['overlap']:.0e}, {figures['newton_iterations']} iterations", fontsize=10

@@ -109,7 +109,7 @@ if args.plot:
             middle.set_xlabel("cells around the edge")
             middle.set_ylabel("settlement of M in micrometres")
             middle.grid(alpha=0.25)
-            middle.legend(frameon=False)
+            middle.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=2, columnspacing=1.0)
 if args.output:
     with uem.ResultsWriter(f"{args.output}/punch_axisymmetric", problems[FRICTION[-1]]) as writer:
         writer.write(1.0)

@@ -111,9 +111,9 @@ with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.6)) as (left, right):
             order = np.argsort(at[0])
             right.plot(at[0][order], at[1][order], "0.5" if seal is reference else ".", label=name)
     if right:
-        right.set(xlabel="distance from the middle", ylabel="pressure on the plate / E", ylim=(0.0, None))
+        right.set(xlabel="distance from the middle", ylabel="pressure on the plate / E", ylim=(0.0, 1.0))
         right.grid(alpha=0.25)
-        right.legend(frameon=False)
+        right.legend(frameon=False, loc="upper right")
 
 # %%
 assert results["seal_error"] < 0.02, results

@@ -113,7 +113,7 @@ with uem.figure(args.plot, comm, size=(5.0, 3.4)) as (panel,):
         panel.plot(radius(forces) / a_0, forces / pull_off, "k-", lw=1, label="JKR theory")
         panel.plot([row["radius"] / a_0 for row in rows], [row["force"] / pull_off for row in rows], "o", ms=4, label="computed")
         panel.axhline(-1.0, color="0.6", lw=0.8, ls="--")
-        panel.set(xlabel="contact radius / that without a load", ylabel="force / pull-off force of JKR")
+        panel.set(xlabel="contact radius / radius without load", ylabel="force / pull-off force of JKR")
         panel.legend(frameon=False)
 
 # %%

@@ -146,7 +146,7 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
             return quadrature_space(domain, int(given[1]), tuple(shape))
         return _space(domain, given[0], int(given[1]), tuple(shape))
     except Exception as error:  # of which class depends on the version of UFL
-        raise InputError(f"element = {element!r} ({error}): expected a family and a degree that DOLFINx knows") from error
+        raise InputError(f"element = {element!r} ({error}): expected a family and a degree of DOLFINx") from error
 
 
 @kept()

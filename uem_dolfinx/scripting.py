@@ -150,7 +150,7 @@ def _mesh_of(part: Part, mesh: Any) -> Any:
     known = [one.mesh for one in (part if isinstance(part, (list, tuple)) else [part]) if isinstance(one, Tag)]
     if mesh is None and not known:
         raise InputError(
-            f"a measure of {given.shown(part)} needs the mesh as its second argument: only tags of read_gmsh know theirs"
+            f"a measure of {given.shown(part)} needs the mesh as its second argument: only tags of read_gmsh contain theirs"
         )
     found = known[0] if mesh is None else mesh
     return given.kind("mesh", found, hasattr(found, "topology"), "a mesh, as u.function_space.mesh")

@@ -132,7 +132,7 @@ def test_which_functions_follow_the_load():
     raised(uem.InputError, r"contact 'sole': friction\(x, 0.75\)", bad.run)
     raised(
         uem.InputError,
-        "arc_length leads loads, and friction of contact 'sole'",
+        "arc_length controls loads only, but friction of contact 'sole'",
         lambda: Dragged(lambda x, t: t).run(arc_length=True),
     )
 

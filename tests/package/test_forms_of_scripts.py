@@ -177,7 +177,11 @@ def test_refused():
         (uem.SpaceError, "J", problem(J=ufl.TrialFunction(other) * ufl.TestFunction(other) * ufl.dx)),
         (uem.InputTypeError, "jit_options = 3", problem(jit_options=3)),
         (uem.InputError, ("newton = 'ful'", "'full'"), problem(newton="ful")),
-        (uem.InputError, ("rtol is given beside newton", "uem.Newton(rtol=...)"), problem(newton=uem.Newton(), rtol=1e-3)),
+        (
+            uem.InputError,
+            ("rtol is given in addition to newton", "uem.Newton(rtol=...)"),
+            problem(newton=uem.Newton(), rtol=1e-3),
+        ),
         (uem.InputError, ("method = 'quasi'", "'modified'"), lambda: uem.Newton(method="quasi")),
         (uem.InputError, "rtol = 2", lambda: uem.Newton(rtol=2)),
         (uem.InputError, "max_iterations = 0", lambda: uem.Newton(max_iterations=0)),

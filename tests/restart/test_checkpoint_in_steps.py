@@ -57,7 +57,7 @@ def test_interval_and_end(folder, caplog):
     assert begun and state.numbers["step"] == 10 and step_in(path) == 10
     begun, state = counted(path, 10)
     assert begun and state.numbers["step"] == 10
-    assert COMM.rank > 0 or any("going on from the checkpoint" in r.message for r in caplog.records)
+    assert COMM.rank > 0 or any("continuing from the checkpoint" in r.message for r in caplog.records)
     COMM.barrier()
     assert [f.name for f in path.parent.iterdir()] == ["run"]
     with pytest.raises(ValueError, match="every = 0: expected a whole number, 1 or more"):

@@ -93,7 +93,7 @@ def test_checkpoints_of_other_runs(other, match, folder):
     state = small(**other)
     raised(
         uem.CheckpointError,
-        "belongs to another run: " + match + ".*go on with the script",
+        "belongs to another run: " + match + ".*continue with the script",
         lambda: uem.read_checkpoint(folder / "run", state),
     )
     assert all(COMM.allgather(all(bool((u.x.array == -1.0).all()) for u in state.functions.values())))

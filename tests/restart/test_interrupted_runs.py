@@ -248,7 +248,7 @@ def test_terminated(folder):
         (0.1, np.nan, "end = nan: expected a time that is not before the start, 3"),
         (0.1, np.inf, "end = inf"),
         (0.1, 2.9, "end = 2.9: expected a time that is not before the start, 3"),
-        (1e-14, 3.1, "dt = 1e-14: too short to be told from rounding of the times from 3 to 3.1"),
+        (1e-14, 3.1, "dt = 1e-14: below the rounding error of the times from 3 to 3.1"),
     ],
 )
 def test_times_that_are_none(dt, end, match):

@@ -50,7 +50,7 @@ def made(E=100.0, rho=1.0, friction=0.1, scheme=None, coupling="node_to_surface"
 
 
 OTHERS = {
-    "number": ({}, {"E": 200.0}, r"F, its expressions and numbers \(now .*; go on with those"),
+    "number": ({}, {"E": 200.0}, r"F, its expressions and numbers \(now .*; continue with those"),
     "constant": ({"as_what": "constant"}, {"E": 200.0}, r"F, Constant 1 \(now 200, then 100\)"),
     "function": ({"as_what": "function"}, {"E": 200.0}, r"F, Function \d \(now 200, then 100\)"),
     "yield stress": ({"as_what": "plastic"}, {"E": 3.0}, r"material 1, yield_stress \(now 3, then 100\)"),
@@ -112,7 +112,7 @@ def test_settings_that_came_later(name, folder):
     uem.read_checkpoint(folder / "run", made(**same).state())
     raised(
         uem.CheckpointError,
-        rf"other settings: {name} \(now [^;]*, then nothing\); go on with those",
+        rf"other settings: {name} \(now [^;]*, then nothing\); continue with those",
         lambda: uem.read_checkpoint(folder / "run", made(**same | other).state()),
     )
 
@@ -133,9 +133,9 @@ def test_other_steps_are_told(folder, caplog):
         with caplog.at_level(logging.WARNING):
             for _ in uem.time_steps(made(friction=0.0), dt, end, checkpoint=uem.Checkpoint(folder / "run")):
                 pass
-        messages = [r.getMessage() for r in caplog.records if "going on with steps" in r.getMessage()]
+        messages = [r.getMessage() for r in caplog.records if "continuing with steps" in r.getMessage()]
         assert len(messages) == (told if COMM.rank == 0 else 0), (dt, messages)
-        assert not messages or messages[0] == "going on with steps of 0.02; those of the run before the checkpoint were 0.01"
+        assert not messages or messages[0] == "continuing with steps of 0.02; the steps before the checkpoint were 0.01"
 
 
 def test_one_checkpoint_for_two_problems(folder):

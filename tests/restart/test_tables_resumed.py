@@ -36,7 +36,7 @@ def test_table_made_before_the_checkpoint_is_read(kind, folder):
     run(0.04, early=True)
     before = text()
     assert len(before) == 5 + (kind == "energy")
-    with pytest.raises(uem.CheckpointError, match="table.csv was made to go on with before the checkpoint was read"):
+    with pytest.raises(uem.CheckpointError, match="table.csv with resume=True was opened before the checkpoint was read"):
         run(0.06, early=True)
     assert text() == before
     run(0.06, early=False)

@@ -101,7 +101,7 @@ def test_who_goes_in_a_circle_is_named():
                 pair.active = pair.of_all(which)
                 exchanges.choose([wrong(pair, which)], (), False)
 
-        found = raised(error, "goes in a circle", exchange_for_ever)
+        found = raised(error, "the active set cycles", exchange_for_ever)
         assert "upper on lower at (1, 0.5), upper on lower at (2, 0.5), upper on lower at (4, 0.5), and 1 more" in str(found)
 
 
@@ -122,7 +122,7 @@ def test_the_first_alone_finds_any_active_set(most, monkeypatch):
         bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.08])]
         problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], max_iterations=50)
         if most == 0 and rule is not None:
-            raised(uem.ConvergenceError, "goes in a circle", problem.solve)
+            raised(uem.ConvergenceError, "the active set cycles", problem.solve)
             return
         history = problem.solve()
         ends.append((contact.n_active, contact.resultant().force[1], sum(i.exchanges for i in history)))
@@ -199,7 +199,7 @@ def test_states_that_come_again():
         pair.active = pair.of_all([first, True, False])
         return exchanges.visit(norm)
 
-    # it gets better, then nothing changes, then it goes in a circle
+    # it gets better, then nothing changes, then it the active set cycles
     assert not any(visit(k % 2 == 0, 0.85**k) for k in range(10))
     exchanges.begin_step()
     assert not any(visit(True, 1.0) for _ in range(4))
@@ -216,7 +216,7 @@ def test_states_that_come_again():
     # two rounds so far, each of three visits
     for k in range(3 * 3):
         visit(k % 2 == 1, 1.0)
-    error = raised(uem.ConvergenceError, "goes in a circle", lambda: [visit(k % 2 == 1, 1.0) for k in range(9, 14)])
+    error = raised(uem.ConvergenceError, "the active set cycles", lambda: [visit(k % 2 == 1, 1.0) for k in range(9, 14)])
     assert str(error).count("upper on lower") == 1 and "(0, 0)" in str(error)
 
 

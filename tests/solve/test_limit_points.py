@@ -45,7 +45,7 @@ def test_beyond_the_largest_load(size):
 @pytest.mark.parametrize("kind", [ConvergenceError, FrictionError])
 def test_an_answer_takes_the_place_of_advice(kind):
     """What happened and where stays; finer facets and more iterations, which do not help there, go."""
-    words = "the active set goes in a circle: contactors touch and let go by turns: high on low at (0, 1), and 2 more"
+    words = "the active set cycles: contactors touch and separate in turn: high on low at (0, 1), and 2 more"
     error = kind(f"{words}; take smaller load steps, or a target of finer facets there, or less friction")
     error.amend("shorter steps, down to 0.001, are no better")
     assert "finer facets" in str(error)

@@ -124,7 +124,7 @@ def test_a_single_solve_names_the_edge():
     problem, _ = plate_and_block(contactor="plate", thick=0.2, fine=2)
     with pytest.raises(
         uem.TunnellingError,
-        match=r"plate on block: the contactor at \(.*\) comes to a face beside an edge of the target within a step",
+        match=r"plate on block: the contactor at \(.*\) comes to a face next to an edge of the target within a step",
     ):
         problem.solve()
 
@@ -295,7 +295,7 @@ def test_faces_that_look_at_each_other(slope, n, coupling):
     problem.solve()
     assert contact.n_active > 0
     problem, _ = across(-slope, n, coupling)
-    with pytest.raises(uem.TunnellingError, match="comes to a face beside an edge of the target"):
+    with pytest.raises(uem.TunnellingError, match="comes to a face next to an edge of the target"):
         problem.solve()
 
 

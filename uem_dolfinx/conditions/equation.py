@@ -186,7 +186,7 @@ class Periodic(given.Sealed):
             error = SurfaceError(
                 f"{role}: the node at {config.describe(int(follower[i]))} has no partner: its image ({place}) is {distance[i]:.3g} away "
                 f"from the nearest node of '{name_of(self._leader)}'. Expected matching meshes, as by gmsh's Periodic, and a map from the "
-                "follower onto the leader; meshes that do not match are united by Contact(..., tied=True)"
+                "follower onto the leader; meshes that do not match are tied by Contact(..., tied=True)"
             )
         agree(config.comm, error)
         # a node on the axis is its own image
@@ -219,7 +219,7 @@ class Periodic(given.Sealed):
         if n[0] != n[1]:
             raise SurfaceError(
                 f"{role}: '{name_of(self._follower)}' has {n[0]} nodes, '{name_of(self._leader)}' {n[1]}: expected matching meshes, as by "
-                "gmsh's Periodic; meshes that do not match are united by Contact(..., tied=True)"
+                "gmsh's Periodic; meshes that do not match are tied by Contact(..., tied=True)"
             )
 
 

@@ -186,7 +186,7 @@ def check_places(mesh: Any) -> None:
     if len(bad) and number[order[0]] == least:
         error = MeshError(
             f"node {least} of the mesh's input, counted from 0, is at {described(x[order[0]])}: expected finite "
-            "coordinates; mend the mesh, or what has moved its nodes"
+            "coordinates; correct the mesh, or the script that has moved its nodes"
         )
     agree(mesh.comm, error)
 

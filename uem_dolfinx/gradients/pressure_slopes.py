@@ -70,7 +70,7 @@ class PressureSlopes:
         if reduced(self._config.comm, int(np.sum(sharp))):
             raise InputError(
                 f"contact '{contact.name}': nodes at sharp edges of the contactor touch, and their areas towards the target have no "
-                "derivatives here: leave the facets beside the edge out of the contactor, or take forces"
+                "derivatives here: leave the facets next to the edge out of the contactor, or take forces"
             )
         areas, self._pressures = contact.measured_areas(), contact.pressures
         self._over = np.where(areas > 0, 1.0 / np.where(areas > 0, areas, 1.0), 0.0)

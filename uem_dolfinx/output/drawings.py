@@ -277,15 +277,22 @@ class Drawn2D(Drawn):
 
 def add_colour_bar(ax: Any, colours: Any, label: str, aspect: float, **how: Any) -> None:
     """A colour bar as long as a scene whose width is ``aspect`` times its height: to its right, or above a scene that is flat."""
-    if aspect > BAR_ABOVE:
-        # the same thickness as to the right, relative to the scene's height
-        inset = ax.inset_axes((0.0, 1.0 + 0.03 * aspect, 1.0, 0.03 * aspect))
-        ax.figure.colorbar(colours, cax=inset, label=label, orientation="horizontal", **how)
+    from matplotlib.transforms import Bbox
+
+    above, inset = aspect > BAR_ABOVE, ax.inset_axes((0.0, 0.0, 1.0, 1.0))
+
+    def place(*_: Any) -> Any:
+        """Where it is in the figure, whatever the panel's shape."""
+        scene, (width, height) = ax.get_position(), ax.figure.get_size_inches()
+        if above:
+            return Bbox.from_bounds(scene.x0, scene.y1 + 0.12 / height, scene.width, 0.16 / height)
+        return Bbox.from_bounds(scene.x1 + 0.12 / width, scene.y0, 0.16 / width, scene.height)
+
+    inset.set_axes_locator(place)
+    ax.figure.colorbar(colours, cax=inset, label=label, orientation="horizontal" if above else "vertical", **how)
+    if above:
         inset.xaxis.set_ticks_position("top")
         inset.xaxis.set_label_position("top")
-    else:
-        thick = 0.035 * max(1.0, 1.0 / aspect)
-        ax.figure.colorbar(colours, cax=ax.inset_axes((1.0 + 0.8 * thick, 0.0, thick, 1.0)), label=label, **how)
 
 
 def draw_rigid(ax: Any, shape: Shape, box: Array, mirror: bool = False, **line: Any) -> None:

@@ -157,7 +157,7 @@ class Item:
 
 def _need(path: Path) -> None:
     if not path.exists():
-        raise MissingFileError(f"{path} does not exist: expected it beside its .xdmf file, which describes it")
+        raise MissingFileError(f"{path} does not exist: expected it next to its .xdmf file, which describes it")
 
 
 def _described(path: Path) -> tuple[list[tuple[float, int, dict[str, Item]]], tuple[str, Item, Item] | None]:

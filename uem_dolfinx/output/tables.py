@@ -170,7 +170,7 @@ class CsvTable(Closing):
             raise InputError(f"the table {self.path} is closed: write before close(), inside of its with block")
         if self._clock is not None and self._clock.resumed != self._resumed:
             raise CheckpointError(
-                f"the table {self.path} was made to go on with before the checkpoint was read, and would lose the rows up to there: "
+                f"the table {self.path} with resume=True was opened before the checkpoint was read, and would lose the rows up to there: "
                 "call checkpoint.begin(problem.state()) before you make what writes with resume=True"
             )
 

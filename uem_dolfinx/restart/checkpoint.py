@@ -117,7 +117,7 @@ def read_checkpoint(path: str | Path, state: State) -> None:
     for hook in state.collect:
         ask_together(comm, "a function in State.collect", hook)
     with timed("read checkpoint"):
-        trouble = _trouble(comm, f"the checkpoint {path} cannot be read", "check its rights, or go on from another one")
+        trouble = _trouble(comm, f"the checkpoint {path} cannot be read", "check its permissions, or continue from another one")
         content: dict[str, Any] = {}
         with trouble:
             content = _content(path) if comm.rank == 0 else {}
@@ -207,7 +207,7 @@ def _head(end: int, text: bytes) -> bytes:
 
 
 def _damaged(path: Path, expected: str, found: str) -> CheckpointError:
-    remedy = "remove it, and go on from a copy or start anew"
+    remedy = "remove it, and continue from a copy or start anew"
     return CheckpointError(f"the checkpoint {path} is damaged: expected {expected}, found {found}; {remedy}")
 
 
@@ -247,7 +247,7 @@ def _compare(path: Path, found: dict[str, str], expected: dict[str, str]) -> Non
         if found.get(name) != expected.get(name):
             raise CheckpointError(
                 f"the checkpoint {path} belongs to another run: for {name} expected {expected.get(name, 'nothing')}, found "
-                f"{found.get(name, 'nothing')}; go on with the script and mesh that wrote it, or remove it to start anew"
+                f"{found.get(name, 'nothing')}; continue with the script and mesh that wrote it, or remove it to start anew"
             )
 
 
@@ -264,8 +264,8 @@ def _compare_settings(path: Path, found: dict[str, str], state: State) -> None:
     ]
     if found and expected and others:
         raise CheckpointError(
-            f"the checkpoint {path} belongs to a run with other settings: {'; '.join(dict.fromkeys(others))}; go on with those that it "
-            "was written with, or remove it to start anew; to change them on purpose, clear the settings of problem.state()"
+            f"the checkpoint {path} belongs to a run with other settings: {'; '.join(dict.fromkeys(others))}; continue with those that "
+            "it was written with, or remove it to start anew; to change them on purpose, clear the settings of problem.state()"
         )
 
 
@@ -326,7 +326,7 @@ class Checkpoint(given.Sealed):
         if not comm.bcast(found):
             return False
         read_checkpoint(self.path, state)
-        logger.warning("going on from the checkpoint %s; remove it to start anew", self.path)
+        logger.warning("continuing from the checkpoint %s; remove it to start anew", self.path)
         return True
 
     def check(self, *functions: Any) -> None:

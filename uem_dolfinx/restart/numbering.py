@@ -43,7 +43,7 @@ class Numbering:
         meeting = Exchange.to(comm, keys * size // max(bound, 1))
         (met,) = meeting.send(keys)
         distinct, order = np.unique(met, return_inverse=True)
-        unknown = "the mesh does not know the numbering of its input, as meshes made from other meshes do not"
+        unknown = "the mesh has no numbering of an input, like all meshes that are made from other meshes"
         twice = len(distinct) < len(order)
         agree(comm, CheckpointError(f"{unknown}: keep Functions on the mesh that was read") if twice else None)
         first = np.cumsum([0, *comm.allgather(len(distinct))])

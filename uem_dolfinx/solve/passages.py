@@ -85,15 +85,15 @@ def refuse_passages(
                 inside, facet = _through_itself(pair, pair.target, du, moving)
                 places = pair.target.of_facets(facet, pair.target.facets.middles(config.X[pair.target.dofs])[0])
                 _refuse(
-                    pair, inside, "passes through its own body within a step, {:.4g} inside on its way through {}", moving, places
+                    pair, inside, "passes through its own body within a step, up to {:.4g} inside, through {}", moving, places
                 )
         else:
             depth, behind = _through_surface(pair, ways[k][0], motion, longest, moving)
             unsure = np.zeros(len(depth))
-        _refuse(pair, depth, "passes through the target within a step, {:.4g} inside on its way", moving)
+        _refuse(pair, depth, "passes through the target within a step, up to {:.4g} inside", moving)
         behind = np.where(behind > PASSAGE_DEPTH * pair.target.stride, behind, 0.0)
-        _refuse(pair, behind, "touches the target from behind after a step, {:.4g} inside on its way", moving)
-        _refuse(pair, unsure, "comes to a face beside an edge of the target within a step, from {:.4g} away", moving)
+        _refuse(pair, behind, "touches the target from behind after a step, up to {:.4g} inside before", moving)
+        _refuse(pair, unsure, "comes to a face next to an edge of the target within a step, from {:.4g} away", moving)
 
 
 def _listed(target: Any) -> TypeGuard[Neighbour]:

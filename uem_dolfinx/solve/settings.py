@@ -218,5 +218,5 @@ def newton_of(newton: Any, **others: Any) -> Newton:
         return Newton(method=newton, **others)
     defaults = {one.name: one.default for one in fields(Newton)}
     if beside := [name for name, value in others.items() if value is not defaults[name] and value != defaults[name]]:
-        raise InputError(f"{beside[0]} is given beside newton, a Newton: expected it there, uem.Newton({beside[0]}=...)")
+        raise InputError(f"{beside[0]} is given in addition to newton, a Newton: expected it there, uem.Newton({beside[0]}=...)")
     return newton

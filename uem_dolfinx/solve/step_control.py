@@ -49,7 +49,7 @@ class StepControl:
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
         if self._read and nominal != self.nominal:
-            logger.warning("going on with steps of %.6g; those of the run before the checkpoint were %.6g", nominal, self.nominal)
+            logger.warning("continuing with steps of %.6g; the steps before the checkpoint were %.6g", nominal, self.nominal)
         self.nominal, self._cuts, self._read = nominal, 0, False
 
     @property

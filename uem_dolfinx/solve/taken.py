@@ -141,7 +141,7 @@ def in_rows(problem: Any, held: Array | float) -> Array:
     with agreed(problem.comm):
         if len(unknown):
             raise InputError(
-                f"the Dirichlet value of {problem.config.place_of(int(unknown[0]))} is on its way from where the node was before it was "
+                f"the Dirichlet value of {problem.config.place_of(int(unknown[0]))} is being ramped from where the node was before it was "
                 "held, or before the run was interrupted, which depends on steps whose derivatives are not known: expected the end of "
                 "this ramp, load factor 1, or conditions that are the same in all steps"
             )

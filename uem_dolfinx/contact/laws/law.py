@@ -113,7 +113,7 @@ def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], ti
     for what, there in (("friction", slides), ("wear", callable(wear) or wear), ("heat", heats), ("tied", tied)):
         if normal is not None and there:
             raise InputError(
-                f"{what} does not go with normal = {normal!r}, whose contactors are not united with the target: leave it out"
+                f"{what} does not go with normal = {normal!r}, whose contactors are not constrained to the target: leave it out"
             )
     return normal
 

@@ -44,7 +44,7 @@ def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
     what = f"part {name} of the mixed space" if name.isdigit() else f"the {config.name} '{name}'"
     return FloatingBodyError(
         f"nothing holds {what} on the body with its middle at {here}: it becomes {largest:.3g} there, and "
-        f"{residual:.3g} of what drives it is left; give it a Dirichlet condition, or something that its value is to reach equilibrium with"
+        f"{residual:.3g} of its source is not in equilibrium; give it a Dirichlet condition, or a term that depends on its value"
     )
 
 

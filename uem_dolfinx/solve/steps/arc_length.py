@@ -165,8 +165,8 @@ class AlongArc:
         for contact in problem.contacts:
             if follows_load(as_law(contact.friction)):
                 raise InputError(
-                    f"arc_length leads loads, and friction of contact '{contact.name}' follows the load factor: expected friction that "
-                    "does not"
+                    f"arc_length controls loads only, but friction of contact '{contact.name}' follows the load factor: "
+                    "expected friction that does not"
                 )
         if not problem.config.moves:
             refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out")
@@ -229,6 +229,6 @@ def _check_values(problem: UnitedProblem) -> None:
         if not np.array_equal(wanted, problem.committed):
             at = problem.config.place_of(int(np.flatnonzero(wanted != problem.committed)[0]))
             raise InputError(
-                f"arc_length leads loads, and the Dirichlet values of {at} are not those of the committed state: expected values "
+                f"arc_length controls loads only, but the Dirichlet values of {at} are not those of the committed state: expected values "
                 "that do not change with the load factor; bring them there by load_steps of its own, with arc_length=False"
             )

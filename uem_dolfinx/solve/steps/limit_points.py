@@ -51,7 +51,7 @@ class LimitPoint:
         # a known cause replaces advice on meshes and numbers of iterations
         known = isinstance(error, ConvergenceError) and (unstable is not None or self.indefinite) and by_load
         if unstable is not None:
-            on = f"there: {WAYS_ON}" if by_load else f"there, and no static path may go on; {IN_TIME}"
+            on = f"there: {WAYS_ON}" if by_load else f"there, and there may be no static path beyond; {IN_TIME}"
             error.amend(
                 f"at the load factor {unstable:.4g} the equilibrium was unstable, as the united matrix had negative eigenvalues: the "
                 f"bodies buckle or snap {on}",

@@ -97,7 +97,9 @@ def _check(problem: UnitedProblem, step: Step, words: str) -> None:
         if not isinstance(problem.system, BodySystem):
             raise InputError(f"{words}: conditions and contacts change where contact is eliminated alone: leave method out")
         if any(law.perfect for contact in problem.contacts for law in contact.heats):
-            raise InputError(f"{words}: conditions and contacts stay where temperatures are united: give a finite conductance")
+            raise InputError(
+                f"{words}: conditions and contacts cannot change where temperatures are equal on both sides: give a finite conductance"
+            )
 
 
 class Stage:

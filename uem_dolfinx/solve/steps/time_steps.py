@@ -123,7 +123,7 @@ def _check_length(dynamics: Dynamics, dt: float, end: float) -> None:
         raise InputError(f"dt = {dt}: its square, or that of a step that is cut, is no number; take other units of time")
     if _rounding(dynamics, dt, end) > SHORTEST_LENGTH * dt:
         raise InputError(
-            f"dt = {dt}: too short to be told from rounding of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
+            f"dt = {dt}: below the rounding error of the times from {dynamics.start:.6g} to {end:.6g}; count time from 0, or "
             "take longer steps"
         )
 
@@ -213,7 +213,7 @@ def _accurate(problem: UnitedProblem, dynamics: Dynamics, length: float, accurac
     found = error / control.largest_speed if control.largest_speed else 0.0
     if found > accuracy:
         raise StepAccuracyError(
-            f"the error of a step of {length:.3g} is {found:.3g} of the way at the largest speed, above the tolerance {accuracy:g}"
+            f"the error of a step of {length:.3g} is {found:.3g} of the displacement at the largest speed, above the tolerance {accuracy:g}"
         )
     return ORDER_TWO * found <= accuracy
 

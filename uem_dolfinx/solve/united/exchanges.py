@@ -324,9 +324,9 @@ class Exchanges:
         found = sorted(chain(*self._pairs[0].config.comm.allgather(own)), key=lambda f: (f[1], f[0]))
         names = ", ".join(f"{name} at {place}" for _, name, place in found[:NAMED])
         more = f", and {len(found) - NAMED} more" if len(found) > NAMED else ""
-        why = "touch and let go, or stick and slip" if self._frictional else "touch and let go"
+        why = "touch and separate, or stick and slip" if self._frictional else "touch and separate"
         return (FrictionError if self._frictional else ConvergenceError)(
-            f"the active set goes in a circle: contactors {why} by turns: {names}{more}; take smaller load steps, or a target of finer "
+            f"the active set cycles: contactors {why} in turn: {names}{more}; take smaller load steps, or a target of finer "
             f"facets there{', or less friction' if self._frictional else ''}"
         )
 
