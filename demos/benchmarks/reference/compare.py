@@ -2,11 +2,15 @@
 
 python3 demos/benchmarks/reference/compare.py "press fit" belt
 python3 demos/benchmarks/reference/compare.py --decks FOLDER
+
+Iterations are those of all steps of a scene; of decks also those of CalculiX, where it is installed.
 """
 
 import argparse
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,16 +22,35 @@ SCENES: list[dict[str, Any]] = json.loads((HERE / "scenes.json").read_text(encod
 
 
 def figures(scene: dict[str, Any], decks: Path | None = None) -> Any:
-    """What a scene's script writes to its JSON file, in a process of its own; None of a deck that is not in the folder ``decks``."""
+    """What a scene's script writes to its JSON file, in a process of its own, and its iterations.
+
+    None of a deck that is not in the folder ``decks``.
+    """
     script, options = HERE.parent.parent / f"{scene.get('demo')}.py", scene.get("options", "").split()
+    if "closed_form" in scene:
+        script, options = HERE / "closed_forms.py", ["--scene", scene["closed_form"]]
     if "deck" in scene:
         if decks is None or not (decks / scene["deck"]).is_file():
             return None
         script, options = HERE / "decks.py", ["--deck", decks / scene["deck"]]
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "figures.json"
-        subprocess.run([sys.executable, script, *options, "--json", path], check=True, stdout=subprocess.DEVNULL)
-        return json.loads(path.read_text(encoding="utf-8"))
+        path, count = Path(folder) / "figures.json", Path(folder) / "iterations.json"
+        command = [sys.executable, HERE / "iterations.py", count, script, *options, "--json", path]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        return tuple(json.loads(file.read_text(encoding="utf-8")) for file in (path, count))
+
+
+def of_calculix(deck: Path) -> int | None:
+    """Iterations that ``ccx`` takes with a deck, 1 where it is linear; None where no ccx is installed or it does not take the deck."""
+    ccx = shutil.which("ccx")
+    if ccx is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copy(deck, folder)
+        done = subprocess.run([ccx, deck.stem], cwd=folder, capture_output=True, text=True)
+    if done.returncode or "*ERROR" in done.stdout:
+        return None
+    return max(len(re.findall(r"^\s*iteration\s+\d+\s*$", done.stdout, re.MULTILINE)), 1)
 
 
 def at(found: Any, path: list[Any]) -> float:
@@ -50,9 +73,16 @@ def main(names: list[str], decks: Path | None = None) -> None:
             if names:
                 sys.exit(f"{scene['name']} needs the file {scene['deck']} of {scene['source']}: give its folder by --decks")
             continue
+        values, ours = found
+        theirs = of_calculix(decks / scene["deck"]) if decks is not None and "deck" in scene else None
+        counts = [str(n) if n is not None else "–" for n in (ours or None, theirs)]
         for quantity in scene["quantities"]:
-            value = at(found, quantity["path"])
-            print(f"| {scene['name']} | {quantity['what']} | {quantity['reference']:.6g} | {value:.6g} |", flush=True)
+            value = at(values, quantity["path"])
+            print(
+                f"| {scene['name']} | {quantity['what']} | {quantity['reference']:.6g} | {value:.6g} | {' | '.join(counts)} |",
+                flush=True,
+            )
+            counts = ["", ""]
 
 
 if __name__ == "__main__":

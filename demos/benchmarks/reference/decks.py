@@ -125,6 +125,7 @@ SCENES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "beamptied7.inp": tied_beam,
     "contact2.inp": as_it_stands({"end": (494, 1)}),
     "contact3.inp": as_it_stands({"raised": (9, 2)}),
+    "contact6.inp": as_it_stands({"pressed": (3, 2), "raised": (9, 2), "bent": (11, 0)}),
     "ring1.inp": as_it_stands({"inside": (10, 0), "outside": (3, 0)}),
     "ring2.inp": as_it_stands({"outer": (13, 0), "inner": (6, 0)}),
 }
