@@ -161,8 +161,12 @@ class UnitedMatrix:
         comm = self.space.comm
         if comm.size == 1:
             return trial
-        pairs = np.unique(np.column_stack([self.space.owner_of(coupled.column), coupled.row]), axis=0)
-        lists = [np.flatnonzero(np.isin(trial.row, pairs[pairs[:, 0] == rank, 1])) for rank in range(comm.size)]
+        rank, row = np.unique(np.column_stack([self.space.owner_of(coupled.column), coupled.row]), axis=0).T
+        order = np.argsort(trial.row, kind="stable")
+        low, high = (np.searchsorted(trial.row[order], row, side=side) for side in ("left", "right"))
+        counts = high - low
+        places = order[np.repeat(low - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())]
+        lists = np.split(places, np.searchsorted(np.repeat(rank, counts), np.arange(1, comm.size)))
         lists[comm.rank] = np.arange(len(trial.row))
         return Blocks(*Exchange(comm, lists).send(*trial))
 

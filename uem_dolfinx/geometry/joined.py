@@ -14,6 +14,7 @@ from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of
 from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.rank_boxes import RankBoxes
 from uem_dolfinx.geometry.search import ON_SIDE, Feet, MeshTarget
 from uem_dolfinx.parallel import Exchange
 
@@ -133,17 +134,16 @@ class JoinedTarget(MeshTarget):
 
     def project_onto(self, points: Array, surface: Ints) -> FacetProjection:
         """Closest points of ``points (k, gdim)`` on the surfaces numbered ``surface (k,)`` (collective)."""
-        data, size = self.facets.current(corners=True), self.comm.size
-        if size == 1:
+        data = self.facets.current(corners=True)
+        if self.comm.size == 1:
             return self._evaluate(points, self._nearest_here(points, surface, data))
-        near, far = self._bounds(points, surface, data.x)
-        first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
+        boxes = self._boxes(data.x)
+        first = boxes.nearest(points, surface)
         exchange = Exchange.to(self.comm, first)
         found = self._answers(exchange, points, surface, data)
         nearest, feet = self._nearest_foot(points, exchange.rows, found)
         bound = np.linalg.norm(points - nearest.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
-        others = (near <= bound) & (first != np.arange(size)[:, None])
-        exchange = Exchange(self.comm, [np.flatnonzero(o) for o in others])
+        exchange = Exchange(self.comm, boxes.near(points, bound, surface, but=first))
         more = self._answers(exchange, points, surface, data)
         rows = np.append(exchange.rows, np.arange(len(points)))
         return self._nearest_foot(points, rows, Feet._make(map(np.concatenate, zip(more, feet))))[0]
@@ -157,17 +157,7 @@ class JoinedTarget(MeshTarget):
         """Closest points on this rank's facets of each point's surface."""
         return self._on_nearest(points, data, *candidate_pairs(self.shape, data.x, points, surface, self.facets.surface))
 
-    def _bounds(self, points: Array, surface: Ints, x: Array) -> tuple[Array, Array]:
-        """Bounds on the distance of each point from each rank's facets of its surface ``(size, n)``, as ``box_distances`` (collective)."""
-        g, n = points.shape[1], self.facets._begin.shape[1]
-        box = np.full((n, 2, g), -np.inf)
-        np.maximum.at(box[:, 0], self.facets.surface, -x.min(axis=1))
-        np.maximum.at(box[:, 1], self.facets.surface, x.max(axis=1))
-        boxes = np.empty((self.comm.size, *box.shape))
-        self.comm.Allgather(box, boxes)
-        low, high = -boxes[:, :, 0], boxes[:, :, 1]
-        out = 0.5 * (self.shape.lebesgue - 1) * np.where(low <= high, high - low, 0.0)
-        low, high, some = (low - out)[:, surface], (high + out)[:, surface], (low[:, :, 0] <= high[:, :, 0])[:, surface]
-        near = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=2)
-        far = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=2)
-        return np.where(some, near, np.inf), np.where(some, far, np.inf)
+    def _boxes(self, x: Array) -> RankBoxes:
+        """Boxes around each rank's facets of each surface, from nodes ``(m, nn, gdim)`` (collective)."""
+        kind = np.repeat(self.facets.surface, x.shape[1])
+        return RankBoxes(self.comm, x.reshape(-1, x.shape[2]), 0.5 * (self.shape.lebesgue - 1), kind, self.facets._begin.shape[1])

@@ -21,7 +21,8 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, balls_that_meet
 from uem_dolfinx.geometry.facets import FacetData, heights
 from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.geometry.search import Feet, MeshTarget, box_distances
+from uem_dolfinx.geometry.rank_boxes import RankBoxes
+from uem_dolfinx.geometry.search import Feet, MeshTarget
 from uem_dolfinx.geometry.shapes import closest_point
 from uem_dolfinx.geometry.skin import Apart, Skin
 from uem_dolfinx.log import timed
@@ -190,8 +191,8 @@ class Neighbours:
         points, reach = self._made_at[self.nodes], self._reach[own]
         ahead = self._reach[skin.body]
         most = gathered(comm, float(ahead.max(initial=0.0)))
-        near, _ = box_distances(comm, points, self._made_at[skin.dofs].reshape(-1, g), 0.5 * (skin.shape.lebesgue - 1))
-        exchange = Exchange(comm, [np.flatnonzero(near[r] <= reach + most[r]) for r in range(comm.size)])
+        boxes = RankBoxes(comm, self._made_at[skin.dofs].reshape(-1, g), 0.5 * (skin.shape.lebesgue - 1))
+        exchange = Exchange(comm, boxes.near(points, reach, more=most))
         about = Asking(
             points, self._committed[self.nodes], config.X[self.nodes], reach, own, config.to_global(self.nodes),
             skin.corners[self.nodes], skin.cones(self.nodes), self.sides, self.held.T,

@@ -67,8 +67,7 @@ def find_opposite(
     if comm.size == 1:
         i, f = _allowed(target, told, *_candidates(target, here, *asked))
         return _facing(target.shape, planes, faced, i, here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
-    near = _boxes_near(target, here, middle, radius + reach)
-    exchange = Exchange(comm, [np.flatnonzero(n) for n in near])
+    exchange = Exchange(comm, target.boxes(here).near(middle, radius + reach))
     mine = np.arange(len(x))
     *arrived, told, row, rank = exchange.send(*asked, told, mine, np.full(len(x), comm.rank))
     i, f = _allowed(target, told, *_candidates(target, here, *arrived))
@@ -114,12 +113,6 @@ def _facing(
     i = np.flatnonzero(kept)
     i = i[np.lexsort((key[i], facet[i]))]
     return Opposite(facet[i], y[i], nodes[i], key[i])
-
-
-def _boxes_near(target: MeshTarget, here: Array, middle: Array, within: Array) -> Array:
-    """Whether a facet of each rank may lie within a distance of the points ``(size, m)`` (collective)."""
-    near, _ = target.bounds(middle, here)
-    return np.asarray(near <= within)
 
 
 def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reach: Array, normal: Array) -> tuple[Ints, Ints]:

@@ -17,6 +17,7 @@ from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.rank_boxes import RankBoxes
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, beneath, closest_point, unit_normals
 from uem_dolfinx.parallel import Exchange, reduced
 
@@ -87,16 +88,15 @@ class MeshTarget:
             points: positions.
             which: numbers of the contactors at these points ``(n,)``, for targets that depend on the contactor; None: all contactors.
         """
-        data, size = self.facets.current(corners=True), self.comm.size
-        if size == 1:
+        data = self.facets.current(corners=True)
+        if self.comm.size == 1:
             return self._evaluate(points, self._project_here(points, data))
         # the distance found by the rank that seems nearest excludes most other ranks
-        near, far = self.bounds(points, data.x)
-        first = np.where(near <= near.min(axis=0), far, np.inf).argmin(axis=0)
+        boxes = self.boxes(data.x)
+        first = boxes.nearest(points)
         found, feet = self._ask(Exchange.to(self.comm, first), data, points)
         bound = np.linalg.norm(points - found.foot, axis=1) * (1 + EQUALLY_NEAR) + ON_SIDE * self.stride
-        others = (near <= bound) & (first != np.arange(size)[:, None])
-        return self._ask(Exchange(self.comm, [np.flatnonzero(o) for o in others]), data, points, found=feet)[0]
+        return self._ask(Exchange(self.comm, boxes.near(points, bound, but=first)), data, points, found=feet)[0]
 
     def project_on(self, points: Array, facet: Ints) -> FacetProjection:
         """Closest points of ``points (n, gdim)`` on the facets numbered ``facet (n,)`` (collective)."""
@@ -197,15 +197,10 @@ class MeshTarget:
         (facet[exchange.rows],) = exchange.back(np.where(np.append(known, -1)[at] == wanted, number[at], -1))
         return facet
 
-    def bounds(self, points: Array, x: Array) -> tuple[Array, Array]:
-        """Bounds on the distance of each point from the facets of each rank, from the boxes around them ``(size, n)`` (collective).
-
-        Args:
-            points: ``(n, gdim)``.
-            x: nodes of this rank's facets ``(m, nn, gdim)``.
-        """
+    def boxes(self, x: Array) -> RankBoxes:
+        """Boxes around the facets of each rank, from the nodes of this rank's facets ``x (m, nn, gdim)`` (collective)."""
         # curved facets may extend beyond the box of their nodes
-        return box_distances(self.comm, points, x.reshape(-1, points.shape[1]), 0.5 * (self.shape.lebesgue - 1))
+        return RankBoxes(self.comm, x.reshape(-1, x.shape[2]), 0.5 * (self.shape.lebesgue - 1))
 
     def _ask(
         self, exchange: Exchange, data: FacetData, points: Array, facet: Ints | None = None, xi: Array | None = None,
@@ -377,27 +372,6 @@ def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: 
     return order[first]
 
 
-def box_distances(comm: MPI.Comm, points: Array, places: Array, out: float = 0.0) -> tuple[Array, Array]:
-    """Bounds on the distance of each point from the positions on each rank, by their bounding boxes ``(size, n)`` (collective).
-
-    Args:
-        comm: communicator.
-        points: ``(n, gdim)``.
-        places: positions on this rank, inside its box ``(m, gdim)``.
-        out: relative enlargement of the box to each side.
-    """
-    box = np.stack([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])
-    boxes = np.empty((comm.size, *box.shape))
-    comm.Allgather(box, boxes)
-    near, far = np.full((2, comm.size, len(points)), np.inf)
-    for r in np.flatnonzero(boxes[:, 0, 0] <= boxes[:, 1, 0]):
-        more = out * (boxes[r, 1] - boxes[r, 0])
-        low, high = boxes[r, 0] - more, boxes[r, 1] + more
-        near[r] = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
-        far[r] = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=1)
-    return near, far
-
-
 def nearest_of(comm: MPI.Comm, points: Array, places: Array, within: float, values: Array) -> tuple[Array, Array]:
     """Distance of each point from the nearest position on any rank, and the values there (collective).
 
@@ -413,8 +387,7 @@ def nearest_of(comm: MPI.Comm, points: Array, places: Array, within: float, valu
     Returns:
         Distances ``(n,)``, infinite if no position is near, and values ``(n, k)``, zero there.
     """
-    near, _ = box_distances(comm, places, points)
-    sent = [np.flatnonzero(n <= within * (1 + EQUALLY_NEAR)) for n in near]
+    sent = RankBoxes(comm, points).near(places, np.full(len(places), within * (1 + EQUALLY_NEAR)))
     there, told = Exchange(comm, sent).send(places, values)
     distance, found = np.full(len(points), np.inf), np.zeros((len(points), values.shape[1]))
     if len(there) and len(points):
