@@ -14,9 +14,9 @@ Options:
 # runs with c = 30 to the free end and back. All the while the wall feels the pressure rho c v = 300; then the bar leaves as fast as
 # it came, without any vibration: contact from 0.5 to 1.166667.
 #
-# Dropped from a height of 5 under a gravity of 10 it touches at 1, 11/3, 19/3 and leaves at 5/3, 13/3, 7. As it goes on falling
-# during contact, the pressure rises from 300 to 500 in the first contact. The bar leaves vibrating, so that it falls from 500 to
-# 300 in the second; then all begins anew.
+# Dropped from a height of 5 under a gravity of 10 it touches at 1, 11/3, 19/3 and leaves at 5/3, 13/3, 7. Since the bar keeps falling
+# during contact, the pressure rises from 300 to 500 in the first contact. The bar leaves vibrating, so that it falls from 500 to 300 in
+# the second; then all begins anew.
 #
 # Contactors with mass collide with the wall: the trapezoidal rule throws them to and fro and feeds energy into the bar at every
 # touch. Their mass is therefore handed on to the nodes around, which keeps mass, centre and moments of inertia.

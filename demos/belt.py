@@ -10,14 +10,14 @@ Options:
 # %% [markdown]
 # # Belt on a pulley
 #
-# A thin belt lies around half of a fixed pulley. Its slack end is pulled by the force T2, its tight end is drawn down until the belt slips
+# A thin belt lies around half of a fixed pulley. The force T2 pulls its slack end. Its tight end is moved down until the belt slips
 # everywhere. Where the tension is T, the belt presses the pulley by p = T/R per length, and friction mu p makes T grow along the belt by
 #
 # $$
 # \frac{dT}{d\varphi} = \mu T, \qquad \frac{T_1}{T_2} = e^{\mu \varphi}
 # $$
 #
-# (Euler, 1769; Eytelwein, 1808). Before, slip begins at the tight end and eats its way round: behind it the belt still sticks under T2.
+# (Euler, 1769; Eytelwein, 1808). Before, slip begins at the tight end and spreads along the belt; the remaining part sticks under T2.
 # Friction acts on the inside of the belt, half its thickness t below its axis, which makes the exponent smaller by t / (2 R) of itself.
 
 # %%
@@ -35,7 +35,7 @@ R, nu, slack = 1.0, 0.0, 0.001
 
 # %% [markdown]
 # ## One belt
-# The way of the tight end is more than the belt stretches, so that all of it slips at the end.
+# The tight end moves by more than the elongation of the belt, so that all of the belt slips at the end.
 
 
 # %%

@@ -12,8 +12,8 @@ Options:
 # # A blade in its disc
 #
 # The root of a turbine blade hangs in a slot of the disc. Rotation presses its flanks against those of the slot, and only then are they
-# one structure. Natural frequencies are those of small vibrations about this state: contactors that stick are united in all components,
-# those that slip along the normal alone. With P of that state
+# one structure. Natural frequencies are those of small vibrations about this state: sticking contactors are constrained in all
+# components, slipping contactors in the normal component only. With P of that state
 #
 # $$
 # P^\mathsf{T} K P\, q = \omega^2 P^\mathsf{T} M P\, q
@@ -36,9 +36,9 @@ E, nu, density, radius = 210e9, 0.3, 7850.0, 0.5
 
 # %% [markdown]
 # ## Spin it up, and ask
-# The centrifugal force of the blade is a body force that grows outwards. Friction on the shoulders from none to more than the contact
-# needs, and last a tie, which sticks everywhere. `sliding="fixed"` leaves out that the shoulders turn with the disc, of which one piece
-# knows nothing.
+# The centrifugal force of the blade is a body force that grows outwards. The friction of the shoulders ranges from zero to more than
+# sticking requires; last, a tie sticks everywhere. `sliding="fixed"` neglects the rotation of the contact normals, since a single piece
+# has none.
 
 
 # %%

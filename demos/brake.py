@@ -11,8 +11,8 @@ Options:
 # # Brake
 #
 # A pad is pressed by a pressure p onto a disc that moves past it with the speed v. Friction makes the heat `mu p v` per area, of which
-# the share f enters the pad. Where the pad is guided and insulated its temperature is that of a slab of the thickness H under a constant
-# flux, a parabola that rises evenly after a while, and before that a series.
+# the share f enters the pad. A guided and insulated pad has the temperature of a slab of thickness H under a constant flux: a series at
+# first, later a parabola that rises at a constant rate.
 #
 # An elastic block that is held at its tail tilts under the drag: pressures differ from place to place, and a base of the same material
 # takes the other half of the heat. What both have in them is the work of friction, to rounding.

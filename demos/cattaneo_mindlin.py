@@ -86,7 +86,7 @@ writer = uem.ResultsWriter(f"{args.output}/cattaneo_mindlin", problem) if args.o
 
 # %% [markdown]
 # ## The closed form
-# After a reversal the change of friction is twice that of a first loading by half of the amplitude.
+# The change of friction after a reversal is twice the friction of a first loading by half of the amplitude.
 
 
 # %%

@@ -19,8 +19,8 @@ Options:
 #
 # A link that hangs in another one touches it with one or two nodes. It swings about them like a pendulum, and turns about the vertical:
 # the first motion is resisted by no contact, but by the weight, to second order, the other by nothing at all. Rigid motions along the
-# loads, by which bodies otherwise come to rest in statics, would roll it from facet to facet for ever. Instead each step goes on from the
-# last one, u_old, in a medium with the drag
+# loads, by which bodies otherwise come to rest in statics, would roll it from facet to facet for ever. Instead each step starts from the
+# previous one, u_old, in a medium with the drag
 #
 #     c (u - u_old)   per unit of volume,    c -> 0,
 #

@@ -15,9 +15,9 @@ Options:
 #
 #     F = d / (2 f),    f = L^3 / (192 E I) + L / (4 k G A),
 #
-# as two beams in a row (Timoshenko, k = 5/6). Where their sections stand on a corner, they touch in one point of two edges; where they
-# lie on a face, four pairs of edges cross at the corners of a square. No node need be near: the equation of a crossing holds the
-# closest points of both edges apart along their common normal,
+# as two beams in a row (Timoshenko, k = 5/6). If their sections rest on a corner, they touch in one point of two edges; where they lie on
+# a face, four pairs of edges cross at the corners of a square. No node need be near: the equation of a crossing holds the closest points
+# of both edges apart along their common normal,
 #
 #     n . (sum_a N_a du_a - sum_b M_b du_b) = -g,    n = t1 x t2 / |t1 x t2|.
 

@@ -41,7 +41,7 @@ chi = np.sqrt(2 * (1 + nu) / 11 * (3 - 2 * (gamma / (1 + gamma)) ** 2))
 
 # %% [markdown]
 # ## The scene
-# The ends are held at their faces by vertical displacements. Only the bonded part of the upper arm is a contactor: what is cracked does
+# The ends are held at their faces by vertical displacements. Only the bonded part of the upper arm is a contactor: cracked surfaces do
 # not touch. Contactors that close are united with the lower arm, as in any contact.
 
 # %%

@@ -17,9 +17,9 @@ Options:
 # A cover of 60 x 40 x 12 mm with walls and a rib of 2 mm falls with one corner ahead. The corner is crushed, the cover rebounds and
 # turns. One declaration covers contact with the floor and of the cover with itself.
 #
-# Steps are explicit, by central differences. All nodes of thin walls are on surfaces, so contactors keep their mass: nodes move freely in a
-# step, and the united system of masses PᵀMP then brings them back onto the surfaces they have entered. No penalty is chosen, gaps are
-# closed to rounding, and the step is that of the cells. A node that hits the floor is stopped as in a plastic impact.
+# Steps are explicit, by central differences. All nodes of thin walls are on surfaces, so contactors keep their mass: nodes move freely in
+# a step, and the united system of masses PᵀMP then brings them back onto the surfaces they have entered. There is no penalty to choose,
+# gaps are closed to rounding, and the cells alone limit the step. A node that hits the floor is stopped as in a plastic impact.
 
 # %%
 import time

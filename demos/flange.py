@@ -25,7 +25,7 @@ Options:
 # $$
 #
 # with phi from one solve of the linear structure, in which all faces are tied. The joint itself carries F - P. Its pads are pulled
-# beside their middle: they open from the pipe outwards, and then the bolt takes up ever more, as it is pried.
+# eccentrically: they open from the pipe outwards, and then the bolt takes up ever more, as it is pried.
 
 # %%
 from typing import Any
@@ -74,7 +74,7 @@ def make(n: float, tied: bool) -> tuple[uem.UnitedProblem, list[uem.Preload], fe
 
 # %% [markdown]
 # ## phi
-# The linear structure, with bolts as long as they were drawn.
+# The linear structure, with bolts of their initial length.
 
 
 # %%

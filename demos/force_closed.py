@@ -21,8 +21,8 @@ Options:
 # p_0 = \sqrt{\frac{P E^*}{\pi R}}, \qquad a = \frac{2 P}{\pi p_0}, \qquad \frac{1}{E^*} = \frac{2 (1 - \nu^2)}{E}.
 # $$
 #
-# Nothing but the slopes of facets tells where along the block it comes to rest. With either coupling, `node_to_surface` or
-# `--coupling mortar`, P is the weight.
+# Only the slopes of the facets determine where along the block it comes to rest. With either coupling, `node_to_surface` or `--coupling
+# mortar`, P is the weight.
 
 # %%
 import common

@@ -10,9 +10,9 @@ Options:
 # %% [markdown]
 # # A cylinder on a block
 #
-# A quarter disc of radius R = 3 stands on a block of the same material. Its top is pushed down by 0.006 in five steps; the
-# block's bottom slides on rollers and x = 0 is a plane of symmetry. Half-spaces under the line load P would, after Hertz,
-# touch over the half width a and press each other with
+# A quarter disc of radius R = 3 rests on a block of the same material. Its top is pushed down by 0.006 in five steps; the block's bottom
+# slides on rollers and x = 0 is a plane of symmetry. Half-spaces under the line load P would, after Hertz, touch over the half width a
+# and press each other with
 #
 # $$
 # p(x) = p_0 \sqrt{1 - \frac{x^2}{a^2}}, \qquad p_0 = \sqrt{\frac{P E^*}{\pi R}}, \qquad a = \frac{2 P}{\pi p_0},

@@ -12,8 +12,8 @@ Options:
 # %% [markdown]
 # # A hub on a shaft
 #
-# A hollow shaft of radii a and b in a hub of radii b and c, drawn with the same radius at the seat: the interference is a number,
-# `offset`, which takes both surfaces together to be thicker than drawn. So one mesh serves for every fit. What the meshes, which do not
+# A hollow shaft of radii a and b in a hub of radii b and c, meshed with the same radius at the seat: the interference is a number,
+# `offset`, by which both surfaces together are thicker than in the mesh. So one mesh serves for every fit. What the meshes, which do not
 # match, leave between them is less than a thousandth of it, and `adjust` takes it away.
 #
 # 1. The fit: the offset grows to delta. The shaft's hole and the hub's outside are held, and with Lamé's displacements

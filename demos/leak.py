@@ -11,7 +11,7 @@ Options:
 # # A seal that leaks
 #
 # Two flanges of width and height 1 are pressed together by bolts, which act like a bed of springs of stiffness k per area with the
-# preload q. A fluid of pressure p stands on both sides of the joint. It enters where the joint is open and connected with a side.
+# preload q. A fluid of pressure p acts on both sides of the joint. It enters where the joint is open and connected with a side.
 #
 # With the heights h of the flanges the contact pressure is $q / (1 + 2 h k / E)$ as long as the joint is closed. A fluid of a lower
 # pressure reaches the outermost contactors only. At a higher pressure it runs through the joint and lifts the upper flange, until

@@ -27,7 +27,7 @@ Options:
 # - `kratos`: mortar with an augmented Lagrangian, in 3D, see `benchmarks/peers/by_kratos.py`; `--kratos` names a Python that has it.
 #
 # With `--friction 0.3` the scene is that of `cattaneo_mindlin.py` in 2D, led down in one step and sideways in another, so that part of
-# the contact slips. GetFEM's nodal contact knows no history of friction, and is left out.
+# the contact slips. GetFEM's nodal contact has no history of friction, and is left out.
 #
 # Times are those of the processor, medians of warm runs, from the mesh in memory to the solution, without compilation: other work on
 # the machine changes them little. CalculiX is timed as a process, with its start and its reading of the input. The error is that of

@@ -17,8 +17,8 @@ Options:
 #
 # These are figures of one mesh: at the end of the flat face pressures rise to six times their mean over less than a millimetre, and every
 # mesh without cells as small is too stiff there. code_aster's linear cells (model A) give -0.130734 mm and -0.128580 mm. The mesh is not
-# described; with 12 cells around the edge, as solids4foam takes for the same benchmark, we come to what its quadratic cells give, and
-# with finer ones to what all should.
+# described; with 12 cells around the edge, as solids4foam uses for the same benchmark, the result agrees with code_aster's quadratic
+# cells; finer cells give the converged value.
 
 # %%
 import common

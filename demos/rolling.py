@@ -41,7 +41,8 @@ k = (1 + (r / R) ** 2) / 2
 
 # %% [markdown]
 # ## One disc
-# It is pressed on by its weight across the plane first. Its way is that of its centre of mass; its angular velocity that about it.
+# It is pressed on by its weight across the plane first. Its displacement is the displacement of its centre of mass; its angular velocity
+# that about it.
 
 
 # %%
@@ -103,8 +104,8 @@ def run(alpha: float):
 
 # %% [markdown]
 # ## The figures
-# After the tilt friction grows with the shear of the disc first, and the disc vibrates. Accelerations are those of the parabola and the
-# line that come nearest to what was measured in the later three quarters.
+# After the tilt friction grows with the shear of the disc first, and the disc vibrates. Accelerations are fitted by a parabola and a line
+# to the displacements and speeds of the last three quarters.
 
 # %%
 rows, curves = [], []

@@ -15,8 +15,8 @@ Options:
 # At nu = 0.5 the pressure no longer follows from the displacement: it is a second unknown, of one degree less (Taylor and Hood).
 # The contacts unite components of the displacement; the pressure is a part of the same mixed space, and stays as it is.
 #
-# The force is compared with that of `oring.py`, in displacements alone with nu = 0.4999 and fewer points of integration, on a mesh four
-# times as fine.
+# The force is compared with the result of `oring.py` on a mesh four times as fine, with displacements as the only unknowns, nu = 0.4999
+# and reduced integration.
 
 # %%
 import common

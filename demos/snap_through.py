@@ -9,11 +9,10 @@ Options:
 # %% [markdown]
 # # Snap-through
 #
-# Two slender cantilevers reach over each other. A point of the upper one is moved down by w; its tip A comes upon the lower beam,
-# bends it down and slides on it towards its end, through large rotations: the first example of [UEM], in dimensions that let
-# every phase of it occur. The load P that this takes grows up to a limit point, at which the beams would snap through under a
-# dead load, falls, and grows again. P has kinks where A goes on to the next facet. At last A slides off, and the lower beam
-# springs back.
+# Two slender cantilevers reach over each other. A point of the upper one is moved down by w; its tip A meets the lower beam, bends it
+# down and slides towards its end, with large rotations: the first example of [UEM], in dimensions that let every phase of it occur. The
+# load P that this takes grows up to a limit point, at which the beams would snap through under a dead load, falls, and grows again. P has
+# kinks where A moves to the next facet. At last A slides off, and the lower beam springs back.
 #
 # Led by its displacement, the limit point is a state like any other: the direction in which the load would snap is prescribed,
 # and P'KP stays positive definite. Without friction contact does no work, so that as long as it lasts the work of the load is
@@ -46,8 +45,8 @@ reference = {
 #
 # A point has no facet to integrate over: with `--coupling mortar` it keeps the equation of a node, and the figures are the same.
 #
-# The beam that springs back passes the one that held it. A is then far below the lower beam's top, and yet not in this beam but behind it;
-# `thickness` tells the two apart for a contactor that has been past the target's end.
+# The beam that springs back passes the one that held it. A is then far below the lower beam's top, and yet not in this beam but behind
+# it; `thickness` distinguishes the two for a contactor that has been past the target's end.
 
 # %%
 mesh, tags = uem.read_gmsh(common.MESHES / "cantilevers.geo", comm, gdim=2)

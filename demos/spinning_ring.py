@@ -57,8 +57,8 @@ def angular_momentum(dynamics: uem.Dynamics, dt: float, x: np.ndarray, v: np.nda
 
 # %% [markdown]
 # ## One throw
-# The ring turns as a rigid body before it touches: its velocity is that of its middle and the spin about it. A turn strains no
-# St Venant-Kirchhoff material.
+# The ring turns as a rigid body before it touches: its velocity consists of the velocity of its centre and the spin about it. A turn
+# strains no St Venant-Kirchhoff material.
 
 
 # %%

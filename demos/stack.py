@@ -11,8 +11,8 @@ Options:
 # %% [markdown]
 # # A stack of three blocks
 #
-# Three unit blocks stand between lateral rollers, the lowest on the ground. Their Young's moduli alternate between 1 and `ratio`;
-# the top of the stack is pushed down by d. Held at its sides, a block is an oedometer of modulus
+# Three unit blocks lie on each other between lateral rollers, the lowest on the ground. Their Young's moduli alternate between 1 and
+# `ratio`; the top of the stack is pushed down by d. Held at its sides, a block is an oedometer of modulus
 #
 # $$
 # M = \frac{E (1 - \nu)}{(1 + \nu)(1 - 2 \nu)},

@@ -10,8 +10,8 @@ Options:
 # %% [markdown]
 # # What a scene does not need
 #
-# Every demo runs in its small configuration, in a process of its own, and tells how often each stage was timed. A zero is a stage
-# that the scene did not need:
+# Every demo runs in its small configuration, in a process of its own, and reports how often each stage was run. A zero is a stage that
+# the scene did not need:
 #
 # - *search* for the facets near the contactors: not on rigid surfaces, which are projected onto at once;
 # - *projection* onto the target, with the search in it, and then *P* and the product *P'KP*: not where nothing touches;
@@ -20,7 +20,7 @@ Options:
 # - *history*, return mapping and commits: not in elastic bodies;
 # - *output*, fields, tables and checkpoints: only if a file is given. With --output the demos write theirs to folders in DIR.
 #
-# Who touches, sticks or slips is found by exchanges of contactors within a linearised problem. A second table tells how many load or time
+# Who touches, sticks or slips is found by exchanges of contactors within a linearised problem. A second table lists how many load or time
 # steps, Newton iterations and exchanges there were, and how many factorisations, or set-ups of a preconditioner, did for all of them.
 #
 # The demos run on one process each, however many ranks this script has. --demos names some of them, parted by commas; --seconds 1 adds
@@ -157,7 +157,7 @@ with uem.figure(args.plot, comm, size=(9.5, 1.2 + 0.33 * len(found))) as (panel,
 
 # %% [markdown]
 # ## What is known of some demos
-# The bodies of the Hertz scenes are linear, those of the stack stay in contact as they are drawn, walls and paraboloids are rigid.
+# The bodies of the Hertz scenes are linear, those of the stack stay in contact from the start, walls and paraboloids are rigid.
 
 # %%
 static = {"mass": 0, "history": 0}

@@ -74,7 +74,7 @@ problem = uem.UnitedProblem(F, u, **how)
 
 # %% [markdown]
 # ## Pulling off
-# The block's reaction is the force on the sphere. The contact radius is that of the circle whose area is closed.
+# The block's reaction is the force on the sphere. The contact radius is the radius of a circle with the area in contact.
 
 # %%
 rows = []

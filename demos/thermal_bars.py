@@ -10,7 +10,7 @@ Options:
 # %% [markdown]
 # # Bars in series
 #
-# Two guided bars of other conductivities stand end to end between walls. The lower end is cold, the upper one hot. Where the bars touch
+# Two guided bars of different conductivities lie end to end between walls. The lower end is cold, the upper one hot. Where the bars touch
 # the flux q passes by the conductance h of the contact, with a jump q/h of the temperatures: three resistances in series.
 #
 # With a gap between the bars the upper one is as hot as its end all along and grows. When it has grown by the gap it presses on the
@@ -33,8 +33,8 @@ L, k_low, k_high, E, alpha, hot = 1.0, 25.0, 50.0, 2e11, 1.2e-5, 200.0  # m, N, 
 # %% [markdown]
 # ## The scene
 # A mixed Function holds displacement and temperature; with nu = 0 everything is one-dimensional. The conductance names the part of the
-# space that is the temperature. The hot end's temperature follows the load factor, as all Dirichlet values do. The bars are drawn
-# together, and the gap is an offset of the contact. With `--coupling mortar` their meshes do not match.
+# space that is the temperature. The hot end's temperature follows the load factor, as all Dirichlet values do. The bars touch in the
+# mesh, and the gap is an offset of the contact. With `--coupling mortar` their meshes do not match.
 
 
 # %%

@@ -32,7 +32,7 @@ E, nu = 1.0, 0.3
 # ## The patch test
 # Two unit blocks, one upon the other, whose outer nodes follow a linear displacement u = A x with all kinds of strain, or a linear
 # temperature: a scalar field is tied in the same words. All others, those of the interface among them, must follow it, too. The error is
-# that of displacements over the largest, or of stresses in the middles of cells over the largest, and likewise of temperatures and
+# the largest error of displacements, or of stresses in the middles of cells, relative to the largest value; likewise for temperatures and
 # fluxes. Meshes are nested for nodes.
 
 

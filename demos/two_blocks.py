@@ -10,9 +10,9 @@ Options:
 # %% [markdown]
 # # Two blocks
 #
-# Two unit squares lie one upon the other between lateral rollers, in plane strain, so that each is an oedometer of modulus
-# M = E (1 - nu) / ((1 + nu) (1 - 2 nu)). The lower one stands on the ground; the top of the upper one is pushed down by d.
-# Shortened by e, a block pushes back with
+# Two unit squares lie one upon the other between lateral rollers, in plane strain, so that each is an oedometer of modulus M = E (1 - nu)
+# / ((1 + nu) (1 - 2 nu)). The lower one lies on the ground; the top of the upper one is pushed down by d. Shortened by e, a block pushes
+# back with
 #
 # $$
 # F = M e \quad \text{(linear)}, \qquad F = \frac{M}{2}\, e\, (1 - e)(2 - e) \quad \text{(St Venant-Kirchhoff)}

@@ -28,8 +28,8 @@ Options:
 # p = Y e^{2 \mu (a - r) / h}, \qquad \bar p = 2 Y \frac{e^q - 1 - q}{q^2}, \qquad q = \frac{2 \mu a}{h}
 # $$
 #
-# with the radius a. The method neglects the shear at the tools and bulging sides, and is good to some per cent where the
-# billet is wider than high. With `--hardening` the mean strain ln(h0 / h) tells the yield stress.
+# with the radius a. The method neglects the shear at the tools and bulging sides, and is good to some per cent where the billet is wider
+# than high. With `--hardening` the yield stress follows from the mean strain ln(h0 / h).
 
 # %%
 import common
@@ -117,7 +117,7 @@ if writer is not None:
 
 # %% [markdown]
 # ## The table
-# The volume that is left tells whether cells lock or leak; the work of the tool goes into plastic flow and friction.
+# The change of volume shows whether the cells lock; the work of the tool goes into plastic flow and friction.
 
 # %%
 F = uem.displacement_gradient(u)

@@ -10,10 +10,10 @@ Options:
 # %% [markdown]
 # # Pins that wear
 #
-# Two elastic pins are pressed onto a rigid floor, which is drawn by s under them without friction. What a pin loses is `k N s`, the
+# Two elastic pins are pressed onto a rigid floor, which is pulled by s under them without friction. What a pin loses is `k N s`, the
 # coefficient k times force and slip. The flat pin loses the depth `k p s` everywhere. The round one, a cylinder of radius R, touches
-# first over Hertz' half width; as it wears its pressure falls and its flat grows. Once elastic strains no longer matter, the half
-# width is that of a chord that cuts off the volume worn, `2 a^3 / (3 R) = k N s`.
+# first over Hertz' half width; as it wears its pressure falls and its flat grows. Once elastic strains no longer matter, the half width
+# is half of the chord that cuts off the worn volume, `2 a^3 / (3 R) = k N s`.
 #
 # In between there is no closed form. The answer is compared with a calculation of another kind: Hertz' half-plane, whose surface
 # sinks by the logarithm of the distance, in strips of constant pressure on a profile that wears.
@@ -131,7 +131,7 @@ common.report(args, results)
 
 # %% [markdown]
 # ## The picture
-# The pins as they are worn, and the depth that the round one has lost, and that of the half-plane.
+# The worn pins, and the worn depth of the round one against the half-plane solution.
 
 # %%
 if args.plot:

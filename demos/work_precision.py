@@ -21,9 +21,8 @@ Options:
 # - `cattaneo`: the cylinder pushed to the side, with friction, against Mindlin's solution;
 # - `bar_impact`: a bar hits a wall, against the exact wave.
 #
-# A penalty, and Uzawa's iteration, need a number: multiples of E/h of the softer body are tried, and the best on each mesh counts,
-# which favours them, since nobody knows it beforehand. Times are medians of warm runs without compilation and without reading
-# the mesh.
+# A penalty, and Uzawa's iteration, need a number: multiples of E/h of the softer body are tried, and the best value on each mesh counts.
+# This favours them, since it is not known beforehand. Times are medians of warm runs without compilation and without reading the mesh.
 
 # %%
 import csv

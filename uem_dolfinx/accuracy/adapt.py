@@ -60,7 +60,7 @@ class Adaptation:
         problem: of the last mesh, solved.
         estimate: of its error.
         meshes: all meshes, in order.
-        reached: whether the last mesh satisfies what was wanted.
+        reached: whether the last mesh satisfies the tolerance or the number of cells.
     """
 
     problem: UnitedProblem

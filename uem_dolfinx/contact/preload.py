@@ -47,7 +47,7 @@ class Preload(Contact):
         name: see ``Contact``.
 
     Raises:
-        InputError, InputTypeError: for an invalid axis or force, none of force and shortening or both, or a rigid target.
+        InputError, InputTypeError: for an invalid axis or force, neither or both of force and shortening, or a rigid target.
     """
 
     def __init__(

@@ -71,7 +71,7 @@ class Deck(given.Sealed):
         contacts: by the names of their surfaces, ``"slave on master"``.
         sections: preloaded sections of bolts by the names of their surfaces.
         steps: data of the steps.
-        left_out: keywords and options without counterpart, or that are taken otherwise than they stand.
+        left_out: keywords and options without counterpart, or that are read differently from their definition.
     """
 
     def __init__(self, mesh: Any, tags: Any, model: Model, numbers: Ints | None, soft: bool):

@@ -306,7 +306,7 @@ class Dynamics(given.Sealed):
 
     @contextmanager
     def without_inertia(self, damping: float = 0.0) -> Iterator[None]:
-        """Context in which the tangent has no mass, and ``damping`` times that of the damping form by the velocity."""
+        """Context in which the tangent has no mass, and ``damping`` times the derivative of the damping form by the velocity."""
         rate = None if self.damping is None else float(self._rate.value)
         factor, self.factor = self.factor, 0.0
         if rate is not None:

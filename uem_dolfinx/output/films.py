@@ -32,7 +32,7 @@ def animate(
     size: tuple[float, float] = (6.4, 4.8),
     **how: Any,
 ) -> Iterator[T]:
-    """Yield the steps of a run and make a film of them, drawn as by :func:`plot_scene` (collective).
+    """Yield the steps of a run and make a film of them, as pictures of :func:`plot_scene` (collective).
 
     All frames have the same window, colours and lengths of arrows, and a title with the load factor or time, with enough digits to
     distinguish them::
@@ -58,7 +58,7 @@ def animate(
         An iterator over the same steps.
 
     Raises:
-        InputError, InputTypeError: for another ending, or an argument that ``plot_scene`` does not know or refuses.
+        InputError, InputTypeError: for another ending, or an argument that ``plot_scene`` does not have or refuses.
         MissingBackendError: before the run, if matplotlib, in 3D PyVista, or for ``.mp4`` ffmpeg is missing.
         OutputError: if the film cannot be written: before the run if its folder cannot be made, or at its end.
     """

@@ -16,7 +16,7 @@ class Adhesion(given.Sealed):
 
     Args:
         energy: of adhesion, an energy per area.
-        strength: largest attraction, a force per area. The zone of attraction beside a contact is of the length
+        strength: largest attraction, a force per area. The zone of attraction around a contact is of the length
             ``energy E* / strength^2``, which cells must resolve.
 
     Raises:

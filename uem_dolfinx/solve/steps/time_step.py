@@ -25,7 +25,7 @@ class TimeStep(ConvergedStep):
         iterations: history of the Newton loop.
         cuts: number of times that the step was shortened.
         touched: names of the contacts that had no active contactor before the step, and have one after it.
-        left: names of the contacts that had an active contactor before the step, and have none after it.
+        left: names of the contacts that had an active contactor before the step, and have no active contactor after it.
     """
 
     number: int
