@@ -122,7 +122,6 @@ REFUSED = {
     "friction": ({"friction": 0.3}, "E", "contact with friction depends on all steps"),
     "wear": ({"wear": 1e-3}, "E", "contact with friction depends on all steps"),
     "chords": ({"chords": True, "degree": 2}, "E", "no gradient with chords=True"),
-    "ties": ({"tied": True}, "E", "do not support ties"),
     "the shape, sliding='small'": ({"sliding": "small"}, "X", "needs contacts of sliding='finite'"),
     "the shape, adjusted gaps": ({"adjust": 0.01}, "X", "no adjust"),
     "the place, adjusted gaps": ({"adjust": 0.01, "target": plane}, "place", "no adjust"),

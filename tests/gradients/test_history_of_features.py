@@ -32,7 +32,7 @@ def ball():
     return uem.RigidSphere([0.4, -3.0], 3.0)
 
 
-def dragged(target=None, moves=False, general=False, equation=False, joined=False, **how):
+def dragged(target=None, moves=False, general=False, equation=False, **how):
     """A block pressed onto another or onto a rigid surface and dragged, on 3 steps; see ``gradient_scenes.dragged``."""
     b = blocks(COMM, "triangle", 3, 4, overhang=0.25)
     mesh, v = b.scene.mesh, ufl.TestFunction(b.V)
@@ -66,9 +66,7 @@ def dragged(target=None, moves=False, general=False, equation=False, joined=Fals
         offset = {} if general or not values["offset"] else {"offset": float(values["offset"])}
         s.contact = uem.GeneralContact(**laws) if general else uem.Contact(b.high, surface, **offset, **laws)
         more = {"equations": [uem.Equation([((0.0, 0.5), (1, 0)), ((1.0, 0.5), (-1, 0))])]} if equation else {}
-        if joined:
-            more = {"couplings": [uem.RigidCoupling(b.top, (0.5, 1.0), force=(0.0, -0.03))]}
-        bcs = [uem.dirichlet(b.V, b.bottom)] + ([] if joined else [push])
+        bcs = [uem.dirichlet(b.V, b.bottom), push]
         problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[s.contact], rtol=1e-13, **({"load": load} if load else {}), **more)
         with uem.recording(problem) as history:
             for _ in uem.load_steps(problem, STEPS):
@@ -109,7 +107,11 @@ EXACT = {
     "a ball that moves": ({"target": ball, "moves": True}, "E top X place turn"),
     "all surfaces": ({"general": True}, "E top X"),
     "all surfaces, mortar": ({"general": True, "coupling": "mortar"}, "E top X"),
+    "ties": ({"tied": True}, "E top X"),
+    "equations": ({"equation": True}, "E top"),
     "friction": ({"friction": 0.3}, "E top X friction"),
+    "friction, all surfaces": ({"friction": 0.3, "general": True}, "E top X"),
+    "friction, equations": ({"friction": 0.3, "equation": True}, "E top"),
     "friction, a function of place": ({"friction": lambda x: 0.15 + 0.1 * x[0]}, "E top more"),
     "friction, a function of place, a plane": ({"friction": lambda x: 0.3 + 0.1 * x[0], "target": plane}, "place more"),
     "friction, a plane that moves": ({"friction": 0.3, "target": plane, "moves": True}, "E top X friction place turn"),
@@ -132,13 +134,9 @@ REFUSED = {
     "friction, mortar": ({"friction": 0.3, "coupling": "mortar"}, "E", "coupling='node_to_surface'"),
     "friction, sliding='small'": ({"friction": 0.3, "sliding": "small"}, "E", "sliding='finite'"),
     "friction, averaged normals": ({"friction": 0.3, "normals": "averaged"}, "E", "normals='facet'"),
-    "friction, all surfaces": ({"friction": 0.3, "general": True}, "E", "Contacts of pairs of surfaces"),
     "Tresca": ({"friction": uem.Tresca(0.01)}, "E", "Coulomb's law"),
     "Stribeck": ({"friction": uem.Stribeck(0.3, 0.2)}, "E", "Coulomb's law"),
     "wear": ({"friction": 0.3, "wear": 1e-2}, "E", "no wear"),
-    "ties": ({"tied": True}, "E", "do not support ties"),
-    "equations": ({"equation": True}, "E", "do not support equations"),
-    "couplings": ({"joined": True, "friction": 0.3}, "E", "do not support equations"),
 }
 
 

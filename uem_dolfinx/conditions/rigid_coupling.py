@@ -110,7 +110,8 @@ class RigidCoupling(given.Sealed):
         #: Joints and springs that it takes part in.
         self.links: list[Any] = []
         self._set: RigidSet | None = None
-        self._evaluated: dict[str, Any] = {}
+        #: Last values of functions of the load factor or time, by name.
+        self.evaluated: dict[str, Any] = {}
 
     # -- in a problem ------------------------------------------------------------------------------------------------------
 
@@ -154,16 +155,20 @@ class RigidCoupling(given.Sealed):
         for name, value in self._declared.items():
             if callable(value) and not isinstance(value, fem.Constant):
                 words = f"the {name} of the RigidCoupling of '{self.name}' at {at:.6g}"
-                self._evaluated[name] = ask_together(comm, words, value, at)
+                self.evaluated[name] = ask_together(comm, words, value, at)
+
+    def values_given(self) -> list[Any]:
+        """Force, moment and prescribed motion as declared."""
+        return list(self._declared.values())
 
     def given_values(self) -> dict[str, Any]:
         """Its present values by name; functions are replaced by their last values."""
-        now = {f"the {name}": value for name, value in (self._declared | self._evaluated).items()}
+        now = {f"the {name}": value for name, value in (self._declared | self.evaluated).items()}
         return {"the point": self.point, "the mass": self.mass, "the inertia": self.inertia, **now}
 
     def _values(self, name: str, size: int) -> Array:
         """Present numbers ``(size,)`` of the force, the moment or a component of the motion."""
-        return values_of(f"{name} of the RigidCoupling of '{self.name}'", self._evaluated.get(name, self._declared[name]), size)
+        return values_of(f"{name} of the RigidCoupling of '{self.name}'", self.evaluated.get(name, self._declared[name]), size)
 
     def loads(self) -> tuple[Array, Array]:
         """Present force ``(gdim,)`` and moment ``(n_turns,)`` at the point (collective)."""

@@ -93,7 +93,7 @@ class RigidRows:
         own = self.set.nodes
         self._free_nodes, self._free, self._avoided = free, free[own], avoided[own]
         self._ramped = np.array([is_ramped(v, loaded) for one in couplings for v in one.prescribed.values()], dtype=bool)
-        self._wanted = self._prescribed()
+        self._wanted = self.values()
         self._basis: Basis | None = None
         #: Displacement at the beginning of the ramp, and its rigid motions.
         self._start: tuple[Array, list[Array]] | None = None
@@ -103,20 +103,29 @@ class RigidRows:
 
     # -- steps -------------------------------------------------------------------------------------------------------------
 
-    def _prescribed(self) -> Array:
+    def values(self) -> Array:
+        """Present values of the prescribed components ``(n_prescribed,)`` (collective)."""
         return np.concatenate([one.wanted() for one in self.couplings])
 
     def begin_step(self, start: Array, fraction: float) -> None:
         """Begin a step at a fraction of a ramp that started at a displacement of the owned nodes ``(n_owned, gdim)`` (collective)."""
-        wanted, own = self._prescribed(), start[self.set.nodes]
+        wanted, own = self.values(), start[self.set.nodes]
         if self._start is None or reduced(self._config.comm, int(not np.array_equal(own, self._start[0]))):
-            # all steps of a ramp count rotations from its start
             motions = [one.motion_of(start, known) for one, known in zip(self.couplings, self._began)]
             self._start, self._began = (own.copy(), motions), [None] * len(self.couplings)
         began = np.concatenate([z[list(one.prescribed)] for one, z in zip(self.couplings, self._start[1])])
         self._wanted = np.where(self._ramped, began + fraction * (wanted - began), wanted) if fraction < 1.0 else wanted
         self._basis = None
         self.at_present()
+
+    @property
+    def led(self) -> tuple[Any, ...]:
+        """Prescribed values of the present step, and ``turns``."""
+        return self._wanted, self.turns
+
+    @led.setter
+    def led(self, led: tuple[Any, ...]) -> None:
+        self._wanted, self.turns = led
 
     @property
     def n_turns(self) -> int:
@@ -266,6 +275,13 @@ class RigidRows:
         self.equations = UnitingEquations(node, direction, gap.ravel(), active, row, followed, coefficients)
         return self.equations
 
+    def opened(self, change: Array, share: float) -> Array:
+        """As for ``UnitedRows``, with prescribed components ``(n_prescribed,)`` (collective)."""
+        aim, basis, s = self._linearised, self.basis, self.set
+        own = np.where(self._ramped & (change != 0.0), share, 1.0) * change
+        lacking = (np.append(own, np.zeros(len(aim.C) - len(own))) / self._lengths(aim))[basis.kept]
+        return -(s.velocities(aim.at, s.X, s.part) @ (self._inverse[:, len(basis.node) :] @ lacking)).ravel()
+
     @property
     def jointed(self) -> bool:
         """Whether joints are among its links."""
@@ -388,8 +404,7 @@ class RigidRows:
         """A matrix of motions ``(n_z, n_z)`` as global nodes ``(1, n)`` and block ``(1, n gdim, n gdim)`` of the basis, on one rank."""
         config, g, basis = self._config, self._config.gdim, self._basis
         assert basis is not None
-        nodes, which = basis.nodes
-        T = (self._inverse * self.set.scale[:, None])[:, : len(which)]
+        (nodes, which), T = basis.nodes, (self._inverse * self.set.scale[:, None])[:, : len(basis.node)]
         block = np.zeros((len(nodes), g, len(nodes), g))
         block[which[:, None], basis.component[:, None], which, basis.component] = T.T @ G @ T
         own = 1 if config.comm.rank == 0 else 0

@@ -67,7 +67,7 @@ class UnitedRows:
         #: Left-hand sides at the beginning of the ramp, of rows and of equations left out, and the fraction of the ramp.
         self._start, self._fraction = (np.zeros(len(self.equations)), np.zeros(len(left))), 1.0
         self.take_load(at)
-        self._wanted = self._values()
+        self._wanted = self.values()
 
     def _make(self, first: Ints, free: Bools, contactors: Bools) -> None:
         """Choose the component that each equation eliminates (collective)."""
@@ -153,7 +153,7 @@ class UnitedRows:
         now = [one.b if known is None else known for one, known in zip(self._declared, self._evaluated)]
         return {f"the value of equations[{i}]": value for i, value in enumerate(now)}
 
-    def _values(self) -> Array:
+    def values(self) -> Array:
         """Present right-hand sides ``(n_values,)`` (collective)."""
         with agreed(self._config.comm):
             found = [
@@ -165,7 +165,21 @@ class UnitedRows:
     def begin_step(self, start: Array, fraction: float) -> None:
         """Begin a step at a fraction of a ramp that started at a displacement of the owned nodes ``(n_owned, gdim)`` (collective)."""
         self._start, self._fraction = (self._sides(start), self._left_sides(start)), fraction
-        self._wanted = self._values()
+        self._wanted = self.values()
+
+    @property
+    def led(self) -> tuple[Any, ...]:
+        """Present values and their ramp."""
+        return self._wanted, self._start, self._fraction
+
+    @led.setter
+    def led(self, led: tuple[Any, ...]) -> None:
+        self._wanted, self._start, self._fraction = led
+
+    def opened(self, change: Array, share: float) -> Array:
+        """Change of the gaps ``(m,)`` with right-hand sides ``(n_values,)``, of which ramped ones change by a ``share``."""
+        gaps = -(self._weights @ change)
+        return np.asarray(np.where(self._ramped[0] & (gaps != 0.0), share, 1.0) * gaps)
 
     def _sides(self, u: Array) -> Array:
         """Left-hand sides of a displacement ``(m,)`` (collective)."""

@@ -35,6 +35,7 @@ class UserRows:
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
 
     Attributes:
+        parts: linear equations, and the rows of couplings.
         equations: of this rank, as last computed.
         multipliers: forces along their eliminated components ``(m,)``, as last set.
         turning: whether rows depend on the displacement.
@@ -50,13 +51,13 @@ class UserRows:
     ):
         self._free = free
         self._config, self.linear, self.each, self._couplings = config, linear, list(rigid), list(couplings)
-        self._parts: list[UnitedRows | RigidRows] = [one for one in (linear, *rigid) if one is not None]
+        self.parts: list[UnitedRows | RigidRows] = [one for one in (linear, *rigid) if one is not None]
         self.turning: bool = any(one.set.large for one in self.each)
         self.equations = self._joined()
         self.multipliers: Array = np.zeros(len(self.equations))
 
     def _joined(self) -> UnitingEquations:
-        return UnitingEquations.join([one.equations for one in self._parts], self._config.gdim)
+        return UnitingEquations.join([one.equations for one in self.parts], self._config.gdim)
 
     @property
     def turns(self) -> list[Any]:
@@ -117,7 +118,7 @@ class UserRows:
 
     def begin_step(self, start: Array, fraction: float) -> None:
         """Begin a step at a fraction of a ramp that started at a displacement ``(n_owned, gdim)`` (collective)."""
-        for one in self._parts:
+        for one in self.parts:
             one.begin_step(start, fraction)
 
     def place(self) -> None:
@@ -129,14 +130,14 @@ class UserRows:
 
     def at_present(self) -> UnitingEquations:
         """The equations at the present displacement, with its gaps (collective)."""
-        for one in self._parts:
+        for one in self.parts:
             one.at_present()
         self.equations = self._joined()
         return self.equations
 
     def largest_gap_here(self) -> float:
         """Largest gap, a length, on this rank."""
-        return max((one.largest_gap_here() for one in self._parts), default=0.0)
+        return max((one.largest_gap_here() for one in self.parts), default=0.0)
 
     def joints_led(self, bound: float) -> bool:
         """Whether prescribed motions have yet to lead jointed parts by more than ``bound``, a length (collective).

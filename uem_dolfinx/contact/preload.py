@@ -111,6 +111,16 @@ class Preload(Contact):
         return self._section.locked
 
     @property
+    def kept(self) -> bool:
+        """Whether the opening is the one at which the section was locked, rather than a given one."""
+        return self._section.locked and not self._section.shortened
+
+    @property
+    def has_axis(self) -> bool:
+        """Whether its axis was given, rather than taken from the section's normal."""
+        return self._axis is not None
+
+    @property
     def opening(self) -> float:
         """Change of the distance between the faces along the axis, a length; negative if the bolt is shortened (collective)."""
         return self._section.find_opening()

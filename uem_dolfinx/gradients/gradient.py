@@ -22,7 +22,9 @@ from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_expression, check_functional, check_parts
 from uem_dolfinx.geometry.axisymmetry import revolved
+from uem_dolfinx.gradients.assemblies import constants_of
 from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
+from uem_dolfinx.gradients.refused import refuse_assembly, refuse_parameter, refuse_shape
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.loading import holds, rules_of, set_by
@@ -49,8 +51,9 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
             reaction of Dirichlet conditions, or the force of contacts, on a part is a functional of ``problem.u``:
             ``ufl.replace(F, {v: w})`` with a Function w that is a unit vector at the part's nodes, 0 elsewhere.
         controls: Constants and Functions in F, J or the values of Dirichlet conditions: moduli, loads, fields of moduli, prescribed
-            displacements. The entries of a Function are its degrees of freedom. ``ufl.SpatialCoordinate(mesh)`` is the shape: the
-            positions of the nodes. A ``ContactParameter`` is the offset of a contact, or the position or rotation of its rigid target.
+            displacements; Constants in equations, couplings and forces at nodes. The entries of a Function are its degrees of freedom.
+            ``ufl.SpatialCoordinate(mesh)`` is the shape: the positions of the nodes.
+            A ``ContactParameter`` is the offset of a contact, the position or rotation of its rigid target, or the force of a preload.
 
     Returns:
         For every control, in the same order, the derivatives by its entries: an array of the shape of a Constant's value or a parameter,
@@ -71,7 +74,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
     pressing = _check_results(problem, J)
     refuse_without_state(problem, [J], [problem.u, *(contact.pressure for contact in pressing)])
     refuse_idle_controls(problem, "controls", some, [J])
-    from uem_dolfinx.gradients.adjoint import Adjoint, Linearised
+    from uem_dolfinx.gradients.adjoint import Adjoint
+    from uem_dolfinx.gradients.linearised import Linearised
 
     with Linearised(problem) as linearised:
         adjoint = Adjoint(linearised, revolved(J), pressing)
@@ -104,7 +108,7 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]],
             which = [k for k, pressure in enumerate(pressures) if pressure is of]
             given.kind("of", of, bool(which), "the pressure of a contact of the problem, or None for the displacement")
         contact = problem.contacts[which[0]]
-    from uem_dolfinx.gradients.adjoint import Linearised
+    from uem_dolfinx.gradients.linearised import Linearised
 
     with Linearised(problem) as linearised:
         motion = linearised.moved(pairs)
@@ -196,17 +200,10 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
                 f"contact '{chords[0]}': there is no gradient with chords=True, whose rows are not the derivative of the gaps: expected "
                 "chords=False"
             )
-        if any(contact.tied for contact in problem.contacts):
-            raise InputError(
-                "gradients do not support ties, which depend on the tied surfaces: expected contacts that are not tied"
-            )
+        refuse_assembly(problem, recorded)
         if any(not keeps_distance(contact) and contact.pair.discretisation.offset is not None for contact in problem.contacts):
             raise InputError(
                 "gradients at an offset need a rigid plane, sphere or cylinder: gaps from other surfaces are distances on these alone"
-            )
-        if problem.linear is not None or problem.bodies.points is not None:
-            raise InputError(
-                "gradients do not support equations, couplings, joints, forces and springs of nodes: expected a problem without them"
             )
     from uem_dolfinx.solve.steps.parted import part_contacts
 
@@ -269,7 +266,14 @@ def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
                     f"J holds '{f.name}', a result of a contact: expected none but the pressures of contacts of this problem; of the gap "
                     "and of forces take what they are made of, the displacement and the residual"
                 )
-    return [contact for contact, p in zip(problem.contacts, pressures) if any(f is p for f in results)]
+    found = [contact for contact, p in zip(problem.contacts, pressures) if any(f is p for f in results)]
+    with agreed(problem.comm):
+        if tied := [contact.name for contact in found if contact.tied]:
+            raise InputError(
+                f"J holds the pressure of '{tied[0]}', which is tied, and whose pressures have no derivatives here: expected pressures of "
+                "other contacts, or forces: the residual with a Function in place of its test function"
+            )
+    return found
 
 
 def refuse_without_state(problem: UnitedProblem, functionals: Sequence[ufl.Form], state: Sequence[fem.Function]) -> None:
@@ -286,7 +290,7 @@ def refuse_idle_controls(
     problem: UnitedProblem, what: str, controls: Sequence[Any], functionals: Sequence[ufl.Form] = ()
 ) -> None:
     """Refuse Constants and Functions that occur neither in the problem nor in a functional (collective)."""
-    forms, beside = [problem.bodies.F, *functionals], [problem.dynamics, problem.materials]
+    forms, beside = [problem.bodies.F, *functionals], [problem.dynamics, problem.materials, constants_of(problem)]
     n, bcs = len(problem.u.x.array), problem.bodies.bcs
     for i, m in enumerate(controls):
         if not isinstance(m, (fem.Constant, fem.Function)):
@@ -327,6 +331,7 @@ def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> 
     """Refuse parameters on which the problem does not depend, or by which there are no derivatives."""
     known = any(contact is m.contact for contact in problem.contacts)
     given.kind(what, m, known, "a parameter of a contact of the problem")
+    refuse_parameter(m, what)
     if m.contact.corners_touch():
         raise InputError(f"{what} is of contact '{m.contact.name}', whose target's corners touch: expected corners=False")
     if m.parameter == "friction" and not m.contact.pair.frictional:
@@ -390,5 +395,6 @@ def _check_shape(problem: UnitedProblem) -> None:
                     f"contact '{contact.name}': there is no gradient by the shape with coupling='mortar' on hexahedra, whose facets warp: "
                     "expected coupling='node_to_surface', or tetrahedra"
                 )
+    refuse_shape(problem)
     if any(contact.adjust or callable(contact.offset) for contact in problem.contacts):
         raise InputError("a gradient by the shape needs an offset that is a number, and no adjust: others change with the shape")

@@ -24,6 +24,7 @@ from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
+from uem_dolfinx.gradients.assemblies import Told, constants_of
 from uem_dolfinx.gradients.gradient import (
     AnyControl,
     check_controls,
@@ -65,7 +66,7 @@ class History(given.Sealed):
         self._laws: list[Any] = problem.materials
         F = problem.bodies.F
         known = (f for f in F.coefficients() if f is not problem.u and material_of(f) is None)
-        self._inputs = [*F.constants(), *known]
+        self._inputs = list({id(m): m for m in [*F.constants(), *known, *constants_of(problem)]}.values())
 
     def __len__(self) -> int:
         """Number of steps."""
@@ -110,6 +111,7 @@ class History(given.Sealed):
             shares=shares,
             held=held,
             dt=0.0 if dynamics is None else dynamics.dt,
+            told=Told.of(problem),
         )
 
     def gradient(
@@ -146,7 +148,7 @@ class History(given.Sealed):
         self._refuse_moved_nodes()
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
         values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
-        offsets = [pair.discretisation.offset for pair in problem.pairs]
+        offsets, told = [pair.discretisation.offset for pair in problem.pairs], Told.of(problem)
         sweep = Sweep(problem, some)
         try:
             begun = False
@@ -162,6 +164,7 @@ class History(given.Sealed):
                 sweep.accelerate(self._start)
         finally:
             self._put(values, friction, offsets)
+            told.put_back(problem)
             now.put_back(problem)
             problem.u.x.array[:] = displacement
         return sweep.found
@@ -271,6 +274,7 @@ class History(given.Sealed):
         """Set the problem to the end of a recorded step, before its commit (collective)."""
         problem = self.problem
         self._put(record.values, record.friction, record.offsets)
+        record.told.put_back(problem)
         record.before.put_back(problem)
         problem.u.x.array[:] = record.displacement
         move_targets(problem, record.motions)
@@ -364,7 +368,6 @@ def _check_friction(problem: UnitedProblem, contact: Any) -> None:
     pair, law = contact.pair, as_law(contact.friction)
     for wrong, expected in (
         (not pair.discretisation.pointwise or problem.config.degree > 1, "coupling='node_to_surface' and cells of degree 1"),
-        (contact.of_all_surfaces, "Contacts of pairs of surfaces"),
         (contact.sliding != "finite", "sliding='finite'"),
         (contact.normals != "facet", "normals='facet'"),
         (type(law) is not Coulomb or law.per_area or law.per_point or follows_load(law), "Coulomb's law, without limit or load"),

@@ -16,13 +16,14 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.mortar.placement import MortarKinematics
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
 
 #: Offsets that differ by this part of a facet's side leave the same terms in rows of weighted gaps, which are linear in them.
 #: [bound; side of a facet; -]
 THICKER = 1e-3
-PARAMETERS = ("friction", "offset", "place", "turn")
+PARAMETERS = ("force", "friction", "offset", "place", "shortening", "turn")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,7 @@ class ContactParameter:
         parameter: ``"offset"``, a uniform increment of the contact's ``offset``, a length; ``"place"``, by which a rigid target
             moves in all directions ``(gdim,)``, a length; ``"turn"``, by which it turns about its present reference point, an angle
             in 2D, a rotation vector ``(3,)`` in 3D; ``"friction"``, a uniform increment of the coefficient of Coulomb's law, for
-            histories.
+            histories; of a ``Preload`` its ``"force"`` or ``"shortening"``, the same increment in all steps that prescribe it.
 
     Raises:
         InputError, InputTypeError: for an argument that is no contact, an unknown word, or a target that is not rigid.
@@ -46,6 +47,8 @@ class ContactParameter:
     def __post_init__(self) -> None:
         given.kind("contact", self.contact, isinstance(self.contact, Contact), "a Contact")
         given.word("parameter", self.parameter, PARAMETERS)
+        if self.parameter in ("force", "shortening") and not isinstance(self.contact, Preload):
+            raise InputError(f"contact '{self.contact.name}': parameter = '{self.parameter}' is one of a Preload")
         if self.parameter in ("place", "turn") and not hasattr(self.contact.target, "project"):
             raise InputError(
                 f"contact '{self.contact.name}': parameter = '{self.parameter}' is one of rigid targets: move nodes instead"

@@ -14,6 +14,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.rigid import Motion
+from uem_dolfinx.gradients.assemblies import Told
 from uem_dolfinx.solve.memory import Memory
 
 
@@ -31,6 +32,7 @@ class Record:
         shares: of Constants and offsets, see ``solve.taken``, by their ids.
         held: shares of Dirichlet values, ghosts included ``(n,)``, or one share of all.
         dt: length of a time step; 0 in statics.
+        told: what equations, couplings and preloads prescribe.
     """
 
     before: Memory
@@ -43,6 +45,7 @@ class Record:
     shares: dict[int, float]
     held: Array | float
     dt: float
+    told: Told
 
 
 class Records:

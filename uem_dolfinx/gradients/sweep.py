@@ -29,10 +29,12 @@ from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.gradients.adjoint import Adjoint, Linearised
+from uem_dolfinx.gradients.adjoint import Adjoint
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
+from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.derivatives import Derivatives, transposed
 from uem_dolfinx.gradients.gradient import AnyControl
+from uem_dolfinx.gradients.linearised import Linearised
 from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of
 from uem_dolfinx.gradients.records import Record
 from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
@@ -59,6 +61,9 @@ class Sweep:
         self.found: list[Any] = [None] * len(controls)
         self._derivatives = Derivatives(problem.bodies.F, problem.u.function_space, problem.config.V)
         self._by_anchors = [np.zeros((0, 0))] * len(problem.pairs)
+        self._sections = [section_of(contact) for contact in problem.contacts]
+        #: Derivatives by the openings of locked sections, by the number of their contact.
+        self._by_opening = [0.0] * len(self._sections)
         self._rates = None if problem.dynamics is None else RateSlopes(problem.dynamics)
         laws: list[Any] = problem.materials
         self._laws = [law.slopes(self._derivatives.a, self._derivatives.test) for law in laws]
@@ -68,7 +73,7 @@ class Sweep:
         step = LinearisedStep(self.problem, record, self._derivatives, self._rates)
         with step:
             handed, self._by_anchors = step.handed_back(self._by_anchors)
-            load = handed.ravel()
+            load = (handed + self._by_openings()).ravel()
             if self._rates is not None:
                 self._begin_rates(self._rates, J)
                 load = load + self._rates.load()
@@ -81,12 +86,32 @@ class Sweep:
                 if isinstance(m, ContactParameter):
                     self._add(k, _left_behind(self.problem, m, handed))
             self._by_anchors = step.by_anchors(adjoint, self._by_anchors)
+            self._pass_back_openings(step, adjoint)
             if self._rates is not None:
                 a = adjoint.a.x.array[: load.size]
                 self._add_density(self._rates.by_density, a)
                 self._rates.pass_back(a, step.damped)
             for law in self._laws:
                 self._pass_back_law(law, adjoint)
+
+    def _by_openings(self) -> Array | float:
+        """Derivative by the positions through openings that are locked after this step ``(n_owned, gdim)`` (collective)."""
+        found: Array | float = 0.0
+        for k, section in enumerate(self._sections):
+            if section is not None and not section.locked:
+                # all ranks have the same sum
+                by, self._by_opening[k] = self._by_opening[k], 0.0
+                found = found + by * section.opening_back() if by else found
+        return found
+
+    def _pass_back_openings(self, step: LinearisedStep, adjoint: Adjoint) -> None:
+        """Add derivatives by openings that were locked before this step (collective)."""
+        first = 0
+        for k, (section, own) in enumerate(zip(self._sections, step.equations)):
+            if section is not None and section.locked and not section.shortened:
+                by = -float(adjoint.by_gaps[first : first + len(own)] @ section.along)
+                self._by_opening[k] += float(reduced(self.problem.comm, by))
+            first += len(own)
 
     def _pass_back_law(self, law: PlasticSlopes, adjoint: Adjoint) -> None:
         """Compute derivatives by a law's history at the beginning of the step, and by its parameters (collective)."""
@@ -156,7 +181,10 @@ class Sweep:
         terms = [(self._derivatives.work, -1.0)]
         for k, m in enumerate(self._controls):
             if isinstance(m, fem.Constant):
-                self._add(k, start.shares.get(id(m), 1.0) * self._derivatives.by_constant(terms, m))
+                own = self._derivatives.by_constant(terms, m) - self._by_nodal_forces(m, a)
+                self._add(k, start.shares.get(id(m), 1.0) * own)
+            elif isinstance(m, ContactParameter) and (section := section_of(m.contact)) is not None:
+                self._add(k, -self._work(a, by_section(section, m.parameter, 0)[1]))
             elif isinstance(m, fem.Function):
                 more = self._derivatives.by_function(terms, m)
                 if m is dynamics.start_velocity:
@@ -164,6 +192,19 @@ class Sweep:
                     more.x.scatter_forward()
                 self._add(k, more)
         self._add_density(self._rates.by_density_at_start, a.array_r[: by_velocity.size])
+
+    def _by_nodal_forces(self, m: fem.Constant, a: PETSc.Vec) -> Array:
+        """Work along ``a`` of the change of the residual with the entries of a Constant at nodes, of its shape (collective)."""
+        found, users = np.zeros(np.shape(m.value)), Users(self.problem, 0.0)
+        for entry in np.ndindex(found.shape) if users.have(m) else ():
+            unit = np.zeros(found.shape)
+            unit[entry] = 1.0
+            found[entry] = self._work(a, users.changes(m, unit)[1])
+        return found
+
+    def _work(self, a: PETSc.Vec, forces: Array) -> Array:
+        """Work of forces at the owned nodes ``(n_owned, gdim)`` along a (collective)."""
+        return np.asarray(reduced(self.problem.comm, float(a.array_r[: forces.size] @ forces.ravel())))
 
     def _refuse_turns(self) -> None:
         """Refuse parameters of rigid targets if contactors touch at the start, and so affect the first acceleration (collective)."""
@@ -208,6 +249,8 @@ class LinearisedStep(Linearised):
             )
         forms.free_petsc_garbage(problem.comm)
         self.Q, self.K, self.G = state.test, problem.bodies.update_tangent(), self.stiffness_of(range(len(pairs)))
+        if problem.linear is not None and (parts := [*problem.linear.curvature(), *problem.linear.stiffness()]):
+            self.G = together(self.G, contact_curvature(parts, self.config.unknowns.vector()))
         K = self.K
         back = transposed(K) if not is_symmetric(K, self.config.unknowns) else K
         self._K_back, self._G_back = back, None if self.G is None else transposed(self.G)

@@ -48,15 +48,16 @@ class Preloaded(Tie):
         force: force in the section while it is not locked, positive in tension.
         locked: whether the opening is constant.
         opening: change of the distance between the faces along the axis, negative if the bolt is shortened.
+        shortened: whether the opening is prescribed rather than locked as it was.
+        along: value of every row for a unit opening ``(m,)``.
     """
 
     def __init__(self, *between: Any, axis: Array | None, free: Bools, **of: Any):
         super().__init__(*between, **of)
         self._given_axis, self._free = axis, free
         self.axis: Array = np.zeros(self.config.gdim)
-        self.force, self.locked, self.opening = 0.0, False, 0.0
-        #: Value of every row for a unit opening ``(m,)``.
-        self._along: Array = np.zeros(0)
+        self.force, self.locked, self.opening, self.shortened = 0.0, False, 0.0, False
+        self.along: Array = np.zeros(0)
         #: Number of the leading row, -1 on other ranks, and the rank that has it.
         self._lead, self._root = -1, 0
 
@@ -93,7 +94,7 @@ class Preloaded(Tie):
         super()._take_rows(rows, off)
         self.whole = True
         i, c = np.nonzero(rows.has)
-        self._along = rows.share[i, c] * self.axis[c]
+        self.along = rows.share[i, c] * self.axis[c]
         comm, main = self.config.comm, int(np.argmax(np.abs(self.axis)))
         if not reduced(comm, len(i)):
             return
@@ -144,9 +145,9 @@ class Preloaded(Tie):
         if self._here is None:
             here = super()._equations()
             if not self.locked:
-                own = here.gap[self._lead] / self._along[self._lead] if self._lead >= 0 else None
+                own = here.gap[self._lead] / self.along[self._lead] if self._lead >= 0 else None
                 self.opening = float(self.config.comm.bcast(own, root=self._root))
-            self._here = replace(here, gap=here.gap - self.opening * self._along)
+            self._here = replace(here, gap=here.gap - self.opening * self.along)
         return self._here
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
@@ -158,14 +159,14 @@ class Preloaded(Tie):
         if self._lead >= 0:
             of = here.row == self._lead
             node = self.config.to_global(here.node[[self._lead]])
-            vectors = np.concatenate([-here.direction[[self._lead]], here.coefficients[of]]) / self._along[self._lead]
+            vectors = np.concatenate([-here.direction[[self._lead]], here.coefficients[of]]) / self.along[self._lead]
             own = np.append(node, here.followed[of]), vectors
         nodes, vectors = self.config.comm.bcast(own, root=self._root)
         others = np.arange(len(here)) != self._lead
-        follow = np.flatnonzero(others & (self._along != 0))
+        follow = np.flatnonzero(others & (self.along != 0))
         row = np.concatenate([here.row, np.repeat(follow, len(nodes))])
         followed = np.concatenate([here.followed, np.tile(nodes, len(follow))])
-        more = -self._along[follow, None, None] * vectors
+        more = -self.along[follow, None, None] * vectors
         coefficients = np.concatenate([here.coefficients, more.reshape(-1, self.config.gdim)])
         # terms at a row's own node belong to its direction
         direction, itself = here.direction.copy(), followed == self.config.to_global(here.node)[row]
@@ -175,20 +176,31 @@ class Preloaded(Tie):
         )
         return made.select(others), i[others], c[others]
 
+    def without_lead(self, nodes: Ints, vectors: Array) -> tuple[Ints, Array]:
+        """Nodes ``(m, k)`` and vectors ``(m, k, gdim)`` of sums at rows, for the rows in use: all if the section is locked (collective)."""
+        if self.locked:
+            return nodes, vectors
+        lead = (nodes[self._lead], vectors[self._lead] / self.along[self._lead]) if self._lead >= 0 else None
+        of, by = self.config.comm.bcast(lead, root=self._root)
+        others = np.arange(len(nodes)) != self._lead
+        more = -self.along[others, None, None] * by
+        at = np.broadcast_to(of, (len(more), len(of)))
+        return np.column_stack([nodes[others], at]), np.concatenate([vectors[others], more], axis=1)
+
     def _bond(self, bond: Array) -> Array:
         """See ``Tie``; the leading row carries the rest of the given force (collective)."""
         return bond if self.locked else bond + self._by_lead(self.force - self._pull(bond))
 
     def _pull(self, bond: Array) -> float:
         """Force in the section from multipliers ``bond (n, gdim)``, positive in tension (collective)."""
-        return -float(reduced(self.config.comm, float(self._along @ bond[self._has])))
+        return -float(reduced(self.config.comm, float(self.along @ bond[self._has])))
 
     def _by_lead(self, force: float) -> Array:
         """Multipliers ``(n, gdim)`` of a section ``force`` that the leading row carries alone."""
         alone = np.zeros(self._has.shape)
         if self._lead >= 0:
             i, c = np.nonzero(self._has)
-            alone[i[self._lead], c[self._lead]] = -force / self._along[self._lead]
+            alone[i[self._lead], c[self._lead]] = -force / self.along[self._lead]
         return alone
 
     @property
@@ -196,12 +208,17 @@ class Preloaded(Tie):
         """See ``Told``; True while the opening is free."""
         return not self.locked
 
-    def applied_forces(self) -> tuple[Ints, Array] | None:
-        """See ``Told``; the pair of forces on the faces while the opening is free (collective)."""
+    def applied_forces(self, force: float | None = None) -> tuple[Ints, Array] | None:
+        """See ``Told``; the pair of forces on the faces, by default the given one, while the opening is free (collective)."""
         if self.locked:
             return None
         assert self.rows is not None
-        return self.rows.handed_on(self._equations(), self._by_lead(self.force))
+        return self.rows.handed_on(self._equations(), self._by_lead(self.force if force is None else force))
+
+    def opening_back(self) -> Array:
+        """Derivative of the opening by the positions of the owned nodes, while it is free ``(n_owned, gdim)`` (collective)."""
+        assert self.rows is not None
+        return self.config.add_at_owners(*self.rows.handed_on(self._equations(), self._by_lead(-1.0)))
 
     @property
     def _has(self) -> Bools:
@@ -222,11 +239,15 @@ class Preloaded(Tie):
     def lock(self) -> None:
         """Lock the present opening (collective)."""
         self.find_opening()
-        self.locked, self._here = True, None
+        self.locked, self.shortened, self._here = True, False, None
 
     def shorten(self, length: float) -> None:
         """Lock the opening that shortens the bolt by a ``length``."""
-        self.locked, self.opening, self._here = True, -length, None
+        self.locked, self.shortened, self.opening, self._here = True, True, -length, None
+
+    def put(self, force: float, locked: bool, shortened: bool, opening: float) -> None:
+        """Set force and opening of a recorded step."""
+        self.force, self.locked, self.shortened, self.opening, self._here = force, locked, shortened, opening, None
 
     def release(self) -> None:
         """Make the opening free."""

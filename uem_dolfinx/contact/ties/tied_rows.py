@@ -224,7 +224,7 @@ def to_facets(
     """Rows of the contactors ``which (n,)``, each at the closest point of its projection p (collective)."""
     n, g, i = len(nodes), config.gdim, np.flatnonzero(which)
     points = config.x[nodes[i]]
-    tab, height = _foot(target, p.x[i], p.xi[i], points)
+    tab, height = foot_below(target, p.x[i], p.xi[i], points)
     row, a = np.nonzero(np.abs(tab.N) > NEGLIGIBLE)
     terms: Terms = (i[row], p.nodes[i][row, a], np.repeat(tab.N[row, a, None], g, axis=1))
     one = np.ones((len(i), 1, g))
@@ -247,7 +247,7 @@ def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: boo
     assert isinstance(d.target, MeshTarget)
     s, own = at.segments, at.nodes
     e, q = at.facet, at.facet[s.pair]
-    tab, height = _foot(d.target, at.y[s.pair], s.eta, np.einsum("qa,qag->qg", at.phi, at.x[q]))
+    tab, height = foot_below(d.target, at.y[s.pair], s.eta, np.einsum("qa,qag->qg", at.phi, at.x[q]))
     k, (nc, nt) = len(e), (at.b.shape[1], tab.N.shape[1])
     N = add_up(s.pair, products(s.weight[:, None] * at.b, tab.N), k).reshape(k, nc, nt)
     by_node, followed = np.zeros((len(own), nc, nc, g)), np.zeros((k, nc, nt, g))
@@ -307,7 +307,7 @@ def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
     return found
 
 
-def _foot(target: MeshTarget, y: Array, xi: Array, points: Array) -> tuple[Tabulated, Array]:
+def foot_below(target: MeshTarget, y: Array, xi: Array, points: Array) -> tuple[Tabulated, Array]:
     """Shape functions of facets ``y (p, nt, gdim)`` below ``points (p, gdim)``, near ``xi (p, fdim)``, and the heights ``(p,)``."""
     _, tab = beneath(target.shape, y, xi, points)
     foot = np.einsum("pa,pag->pg", tab.N, y)

@@ -1,0 +1,87 @@
+"""Ties, preloads, equations and couplings without derivatives, refused by name before any work."""
+
+from __future__ import annotations
+
+from uem_dolfinx.conditions.equation import Equation, Periodic
+from uem_dolfinx.contact.preload import Preload
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.gradients.parameters import ContactParameter
+from uem_dolfinx.solve.problem import UnitedProblem
+
+
+def refuse_assembly(problem: UnitedProblem, recorded: bool) -> None:
+    """Refuse features through which there are no derivatives, by one step or, if ``recorded``, by all steps (to be agreed on).
+
+    Raises:
+        InputError: names the feature.
+    """
+    for contact in problem.contacts:
+        section = contact if isinstance(contact, Preload) else None
+        if contact.tied == "after" and (recorded or contact.pair.tie is None or contact.pair.tie.rows is not None):
+            raise InputError(
+                f"contact '{contact.name}' is tied between steps, where its surfaces were then, of which there is no derivative: expected "
+                "tied=True, or False"
+            )
+        if section is not None and section.kept and not recorded:
+            raise InputError(
+                f"preload '{section.name}' is locked, at an opening that depends on earlier steps: take the steps within "
+                "uem.recording(problem), and use its history"
+            )
+    for coupling in problem.couplings:
+        if getattr(coupling, "distribute", False) and coupling.nodes.large:
+            raise InputError(
+                f"gradients do not support the RigidCoupling of '{coupling.name}', with distribute=True and large rotations, whose nodal "
+                "forces turn with the part: expected rotations='small', or distribute=False"
+            )
+    if problem.dynamics is not None and problem.couplings:
+        raise InputError(
+            "gradients do not support couplings in time, whose parts have velocities and masses of their own: expected statics, or a "
+            "stiff part in place of the coupling"
+        )
+
+
+def refuse_shape(problem: UnitedProblem) -> None:
+    """Refuse ties, preloads, equations and couplings without derivatives by the shape (to be agreed on)."""
+    if problem.couplings:
+        raise InputError(
+            "there is no gradient by the shape with couplings, whose motions depend on the positions of all their nodes: expected a "
+            "problem without them, or other controls"
+        )
+    for one in problem.equations:
+        if not isinstance(one, Equation | Periodic):
+            raise InputError(
+                f"there is no gradient by the shape with a {type(one).__name__}, whose coefficients change with it: expected Equation or "
+                "periodic"
+            )
+    for contact in problem.contacts:
+        if not contact.tied:
+            continue
+        if contact.coupling != "node_to_surface" or not contact.pair.target.n_nodes:
+            raise InputError(
+                f"contact '{contact.name}': there is no gradient by the shape with ties by mortar or to rigid surfaces: expected a tie of "
+                "two bodies with coupling='node_to_surface'"
+            )
+        if problem.config.gdim == 3 and problem.config.mesh.topology.cell_name() == "hexahedron":
+            raise InputError(
+                f"contact '{contact.name}': there is no gradient by the shape with ties of hexahedra, whose facets warp: expected "
+                "tetrahedra"
+            )
+        if isinstance(contact, Preload):
+            if not contact.has_axis:
+                raise InputError(
+                    f"preload '{contact.name}': there is no gradient by the shape with the section's normal as axis: it changes with it; "
+                    "expected an axis"
+                )
+            if contact.kept:
+                raise InputError(
+                    f"preload '{contact.name}' is locked, at an opening that changes with the shape, of which there is no derivative"
+                )
+
+
+def refuse_parameter(m: ContactParameter, what: str) -> None:
+    """Refuse parameters that tied surfaces do not have."""
+    if m.contact.tied and m.parameter not in ("force", "shortening"):
+        raise InputError(
+            f"{what} is the {m.parameter} of contact '{m.contact.name}', which is tied: expected a contact that is not, or the force or "
+            "shortening of a Preload"
+        )
