@@ -21,8 +21,9 @@ Options:
 # - `cattaneo`: the cylinder pushed to the side, with friction, against Mindlin's solution;
 # - `bar_impact`: a bar hits a wall, against the exact wave.
 #
-# A penalty, and Uzawa's iteration, need a number: multiples of E/h of the softer body are tried, and the best value on each mesh counts.
-# This favours them, since it is not known beforehand. Times are medians of warm runs without compilation and without reading the mesh.
+# A penalty, Uzawa's iteration and the proximal point method need a number: multiples of E/h of the softer body are tried, and the
+# best value on each mesh counts. This favours them, since it is not known beforehand. Times are medians of warm runs without
+# compilation and without reading the mesh.
 
 # %%
 import csv
@@ -45,7 +46,7 @@ args = common.arguments(
     sizes=4,
     runs=5,
     problems="signorini,hertz_cylinder,hertz_penalty,cattaneo,bar_impact",
-    methods=",".join(methods.METHODS),
+    methods=",".join(methods.ALL),
 )
 # the indenter's overlap at the start is meant
 logging.getLogger("uem_dolfinx").setLevel(logging.ERROR)
@@ -63,7 +64,7 @@ def names(degree: int, *without: str) -> list[str]:
     """The methods wanted; the barrier is for one rank and degree 1."""
     if degree > 1 or comm.size > 1 or not methods.available("barrier"):
         without += ("barrier",)
-    return [name for name in methods.METHODS if name in args.methods.split(",") and name not in without]
+    return [name for name in methods.ALL if name in args.methods.split(",") and name not in without]
 
 
 # %% [markdown]
@@ -74,7 +75,7 @@ def names(degree: int, *without: str) -> list[str]:
 
 # %%
 if "signorini" in args.problems:
-    most = ("penalty", "augmented", "barrier")
+    most = ("penalty", "augmented", "barrier", "proximal")
     for degree, finer, graded, sizes, ratios, without in (
         (1, 2.0, 1.0, (4, 8, 16, 32), (1.0, 1e6), ()),
         (1, 2.0, 1.0, (4, 8, 16), (1e3,), ()),
@@ -107,7 +108,7 @@ if "hertz_cylinder" in args.problems:
 if "hertz_penalty" in args.problems:
     points += sweep(indenter, (8, 16)[: args.sizes], names(1, "penalty_surface", "barrier"), args.runs, progress=args.verbose)
 if "cattaneo" in args.problems:
-    without = set(methods.METHODS) - set(methods.RUB)
+    without = set(methods.ALL) - set(methods.RUB)
     points += sweep(
         cattaneo, (1 / 15, 1 / 30, 1 / 45)[: args.sizes], names(1, *without), min(args.runs, 1), progress=args.verbose
     )

@@ -36,6 +36,7 @@ SWEEPS: dict[str, tuple[float | None, ...]] = {
     "penalty_surface": (1.0, 100.0, 1e4),
     "augmented": (1.0, 10.0, 100.0),
     "barrier": (0.1, 0.01, 0.001),
+    "proximal": (1e-4, 1e-3, 1e-2, 0.1),
 }
 #: Condition numbers are found up to this number of unknowns.
 CONDITION_UP_TO = 9000
@@ -54,7 +55,7 @@ def measure(scene: Scene, method: str, parameter: float | None = None, runs: int
 
     Args:
         scene: what to solve.
-        method: one of ``methods.METHODS``.
+        method: one of ``methods.ALL``.
         parameter: multiple of the scene's stiffness, or of its h (barrier).
         runs: that are timed; with none the first counts.
         progress: tell the point.
@@ -82,7 +83,7 @@ def measure(scene: Scene, method: str, parameter: float | None = None, runs: int
             start = time.perf_counter()
             problem = methods.create(
                 method, scene.F, scene.u, parameter=None if parameter is None else parameter * scale, bcs=scene.bcs,
-                contacts=[contact], petsc_options_prefix="precision_", **options,
+                contacts=[contact], scale=scene.stiffness, petsc_options_prefix="precision_", **options,
             )  # fmt: skip
             steps = list(scene.run(problem))
             seconds.append(max(comm.allgather(time.perf_counter() - start)))

@@ -19,10 +19,12 @@ if TYPE_CHECKING:
 
 #: Every method, the package itself first.
 METHODS = ("united", "mortar", "penalty", "penalty_surface", "lagrange", "augmented", "barrier")
+#: With those that are for statics without friction alone, which extreme cases leave out.
+ALL = (*METHODS, "proximal")
 #: The package's own, by what unites: nodes on facets, or integrals over both surfaces.
 OWN = ("united", "mortar")
 #: Those that need a number.
-NEED_PARAMETER = ("penalty", "penalty_surface", "augmented", "barrier")
+NEED_PARAMETER = ("penalty", "penalty_surface", "augmented", "barrier", "proximal")
 #: Those that know friction.
 RUB = ("united", "mortar", "penalty", "augmented")
 #: Overlap at which Uzawa's multipliers are good enough, as part of the model's size.
@@ -37,19 +39,23 @@ def available(method: str) -> bool:
     return method != "barrier" or importlib.util.find_spec("ipctk") is not None
 
 
-def create(method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None = None, **options: Any) -> uem.UnitedProblem:
+def create(
+    method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None = None, scale: float | None = None, **options: Any
+) -> uem.UnitedProblem:
     """A problem that reaches contact by ``method``.
 
     Args:
-        method: one of ``METHODS``.
+        method: one of ``ALL``.
         F: as for ``UnitedProblem``.
         u: likewise.
-        parameter: stiffness of the springs, a pressure per length (penalty, penalty_surface, augmented); distance at which the
+        parameter: stiffness of the springs, a pressure per length (penalty, penalty_surface, augmented; of the first proximal step,
+            proximal); distance at which the
             barrier begins, a length (barrier).
+        scale: stiffness of the bodies at the surface, a pressure per length (proximal).
         options: as for ``UnitedProblem``.
     """
-    if method not in METHODS:
-        raise ValueError(f"'{method}' is not known here: expected one of {', '.join(METHODS)}")
+    if method not in ALL:
+        raise ValueError(f"'{method}' is not known here: expected one of {', '.join(ALL)}")
     if (method in NEED_PARAMETER) != (parameter is not None):
         raise ValueError(f"{method} {'needs a parameter' if parameter is None else 'has no parameter'}")
     if method == "mortar":
@@ -67,6 +73,12 @@ def create(method: str, F: ufl.Form, u: fem.Function, *, parameter: float | None
         options.setdefault("max_iterations", MOST_BARRIER_ITERATIONS)
         method_of = partial(BarrierSystem, contacts=options.get("contacts", ()), distance=parameter)
         return uem.UnitedProblem(F, u, method=method_of, **options)
+    if method == "proximal":
+        from benchmarks.rivals.proximal import ProximalSystem
+
+        options.setdefault("max_iterations", MOST_UZAWA_ITERATIONS)
+        proximal = partial(ProximalSystem, tags=tags, stiffness=parameter, scale=scale or parameter)
+        return uem.UnitedProblem(F, u, method=proximal, **options)
     frictional = [contact.friction for contact in options.get("contacts", ())]
     for contact in options.get("contacts", ()):
         # springs have friction of their own

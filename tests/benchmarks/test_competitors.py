@@ -111,6 +111,21 @@ def test_uzawa_reaches_the_united_solution():
     assert overlap(touch) < 1e-3 * overlap(plain.contacts[0])
 
 
+@pytest.mark.parametrize("cell", ["quadrilateral", "triangle"])
+@pytest.mark.parametrize("stiffness", [1.0, 0.1, 10.0])
+def test_the_proximal_point_method_reaches_the_united_solution(cell, stiffness):
+    """From any first step of it; no surface enters the other, and its springs are stiffer than the bodies by its bound."""
+    problem, contact, b = pressed("united", cell=cell, sliding="fixed")
+    run(problem)
+    other, touch, c = pressed("proximal", stiffness, cell=cell, sliding="fixed", scale=E * 6)
+    steps = run(other)
+    u, w = b.scene.gather(b.u), c.scene.gather(c.u)
+    assert np.abs(u - w).max() < 1e-4 * np.abs(u).max()
+    assert abs(force(touch) / force(contact) - 1) < 1e-3
+    assert overlap(touch) < 1e-6 * other.config.size
+    assert methods.counts(steps)[0] < 60
+
+
 @pytest.mark.parametrize("method,parameter", [("penalty", 1e3), ("penalty_surface", 1e3), ("lagrange", None), ("augmented", 1e3)])
 def test_finite_strain_in_steps(method, parameter):
     """All of them follow load steps with finite strain, in equilibrium with the supports."""
