@@ -145,7 +145,7 @@ if args.plot:
                 panels[0].plot(*np.moveaxis(lines, -1, 0).swapaxes(1, 2), f"C{k}-", lw=1)
                 panels[0].plot([], [], f"C{k}-", lw=1, label=label)
             panels[0].set(aspect="equal")
-            panels[0].legend(loc="upper center", bbox_to_anchor=(0.5, 0.9))
+            panels[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=2, frameon=False)
             panels[1].plot([row["load"] for row in rows], [row["force"] for row in rows], ".", label="tube")
             panels[1].plot([touch, *(row["load"] for row in after)], [0.0, *expected], "k-", lw=1, label="elastica")
             panels[1].set(xlabel="p R^3 / EI", ylabel="force between the sides, over EI / R^2")
