@@ -24,7 +24,7 @@ import uem_dolfinx as uem
 from uem_dolfinx.output import drawings, films, pictures, pictures3d, sections
 from uem_dolfinx.output import frames as frames_module
 
-pytest.importorskip("matplotlib")
+mpl_image = pytest.importorskip("matplotlib.image")
 COMM = MPI.COMM_WORLD
 
 
@@ -348,6 +348,11 @@ def test_panels_and_their_letters(folder):
             for left, top, right, bottom in boxes:
                 held[top - 2 : bottom + 2, left - 2 : right + 2] += 1
             assert held.max() == 1 and (held[ink] == 1).all()
+    # a panel that the script takes away
+    with uem.figure(folder / "none.png", COMM) as (panel,):
+        if panel is not None:
+            panel.figure.text(0.5, 0.5, "own drawing")
+            panel.remove()
     raised(uem.InputError, "columns", lambda: uem.figure(folder / "a.png", COMM, columns=0).__enter__())
 
 
@@ -363,6 +368,9 @@ def test_colour_bars_are_as_long_as_the_scene(folder, wide):
             scene, bar = panel.get_window_extent(), panel.child_axes[0].get_window_extent()
             assert (bar.width if wide else bar.height) == pytest.approx(scene.width if wide else scene.height)
             assert bar.y0 > scene.y1 if wide else bar.x0 > scene.x1
+    if COMM.rank == 0:
+        # nothing is cut off
+        assert (mpl_image.imread(folder / "bar.png")[[0, -1], :, :3] > 0.99).all()
 
 
 def test_cells_larger_than_the_window_have_their_colour(folder):

@@ -283,10 +283,13 @@ def add_colour_bar(ax: Any, colours: Any, label: str, aspect: float, **how: Any)
 
     def place(*_: Any) -> Any:
         """Where it is in the figure, whatever the panel's shape."""
-        scene, (width, height) = ax.get_position(), ax.figure.get_size_inches()
+        points, inch = ax.figure.transFigure, ax.figure.dpi
+        scene = ax.get_position().transformed(points)
         if above:
-            return Bbox.from_bounds(scene.x0, scene.y1 + 0.12 / height, scene.width, 0.16 / height)
-        return Bbox.from_bounds(scene.x1 + 0.12 / width, scene.y0, 0.16 / width, scene.height)
+            bar = Bbox.from_bounds(scene.x0, scene.y1 + 0.12 * inch, scene.width, 0.16 * inch)
+        else:
+            bar = Bbox.from_bounds(scene.x1 + 0.12 * inch, scene.y0, 0.16 * inch, scene.height)
+        return bar.transformed(points.inverted())
 
     inset.set_axes_locator(place)
     ax.figure.colorbar(colours, cax=inset, label=label, orientation="horizontal" if above else "vertical", **how)

@@ -129,9 +129,9 @@ def _corners(canvas: Any, axes: list[Any], dpi: float) -> str:
     """The panels with their labels in the saved picture: ``left,top,right,bottom`` in points from its upper left corner."""
     canvas.draw_without_rendering()
     whole, inches = canvas.get_tightbbox(), canvas.dpi_scale_trans.inverted()
-    boxes = [ax.get_tightbbox().transformed(inches) for ax in axes]
+    boxes = [ax.get_tightbbox().transformed(inches) for ax in axes if ax.figure is canvas]
     left, top = whole.x0 - MARGIN, whole.y1 + MARGIN
-    ends = np.array([(box.x0 - left, top - box.y1, box.x1 - left, top - box.y0) for box in boxes])
+    ends = np.array([(box.x0 - left, top - box.y1, box.x1 - left, top - box.y0) for box in boxes]).reshape(-1, 4)
     return " ".join(",".join(map(str, one)) for one in np.rint(dpi * ends).astype(int))
 
 
