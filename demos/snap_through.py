@@ -166,7 +166,7 @@ common.report(args, results)
 
 # %%
 phases = {-5: "in contact", -13: "close to the limit point", -26: "close to the target's end", -27: "after departure"}
-with uem.figure(args.plot, comm, size=(15.5, 6.4)) as (page,):
+with uem.figure(args.plot, comm, size=(10.0, 6.4)) as (page,):
     panels = dict.fromkeys(phases)
     if page:
         canvas = page.figure
