@@ -290,6 +290,40 @@ def test_in_time(what):
         assert float(np.sum(by * change)) == pytest.approx((values[0] - values[1]) / 2e-4, rel=1e-6)
 
 
+def staged(second=None):
+    """A bolt that is tightened by a Step, locked by the next, and loaded; with the values by which it is changed."""
+    s = assembly(feature=preload, axis=(0.1, 1.0))
+    s.load.value[:] = 0.0
+    F = s.field * uem.NeoHooke(s.E, 0.3, kind="plane_strain").residual(s.u, ufl.TestFunction(s.b.V)) * ufl.dx
+    F = F - ufl.inner(s.load, ufl.TestFunction(s.b.V)) * ufl.dx
+
+    def solve(E=1.0, force=0.05, end=(0.03, 0.02)):
+        s.E.value, s.numbers["force"], s.b.u.x.array[:], s.load.value[:] = E, force, 0.0, 0.0
+        s.contact = preload(s, axis=(0.1, 1.0))["contacts"][0]
+        problem = uem.UnitedProblem(F, s.u, bcs=s.bcs, contacts=[s.contact], rtol=1e-13)
+        steps = [uem.Step(name="tighten"), uem.Step(name="pull", loads={s.load: end}, preload={s.contact: None}, n=2)]
+        with uem.recording(problem) as s.history:
+            total = sum(uem.integrate(s.J) for _ in uem.load_steps(problem, steps if second is None else second(s)))
+        return total
+
+    s.solve = solve
+    return s
+
+
+def test_steps():
+    """Steps that tighten, lock and pull: of second order by modulus, force and the load at the end."""
+    s = staged()
+    s.solve()
+    controls = [s.E, uem.ContactParameter(s.contact, "force"), s.load]
+    by = s.history.gradient([s.J] * len(s.history), controls)
+    slope = float(0.3 * by[0] + 0.02 * by[1] + by[2] @ [0.01, 0.02])
+    assert len(s.history) == 3
+    found = uem.taylor_test(lambda h: s.solve(1 + 0.3 * h, 0.05 + 0.02 * h, (0.03 + 0.01 * h, 0.02 + 0.02 * h)), slope, 0.02, 1)
+    assert found >= 1.95
+    others = staged(lambda s: [uem.Step(name="other", bcs=s.bcs)])
+    refused(uem.InputError, "Steps with conditions", others.solve)
+
+
 BOTH_WAYS = ("tie across a gap", "preload", "shortening", "coupling, spring", "coupling, led", "equation")
 
 

@@ -169,7 +169,7 @@ def test_a_node_that_is_nowhere(value, field):
     b.scene.mesh.geometry.x[own, 1] = value
     T = fem.Function(compat.function_space(b.scene.mesh, 1))
     warm = ufl.inner(ufl.grad(T), ufl.grad(ufl.TestFunction(T.function_space))) * ufl.dx
-    words = ("node 7 of the mesh's input", f", {value})", "expected finite coordinates", "mend the mesh")
+    words = ("node 7 of the mesh's input", f", {value})", "expected finite coordinates", "correct the mesh")
     refused(uem.MeshError, words, lambda: uem.UnitedProblem(warm, T) if field == "scalar" else pressed(b))
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ from uem_dolfinx.materials.elastic import material_of
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.memory import Memory, move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.steps.step import Step
 from uem_dolfinx.solve.taken import Taken, led_by, uniform
 
 
@@ -62,6 +64,10 @@ class History(given.Sealed):
         self._start: Record | None = None
         #: Constants and contacts ramped by steps, referenced here so that their ids stay unique.
         self._led: list[Any] = []
+        #: Numbers of the steps that ramped them first; what their values end at has no share in steps before.
+        self._led_from: list[int] = []
+        #: Constants that Steps set by functions of the load factor.
+        self._by_function: list[fem.Constant] = []
         #: Laws with history that have derivatives.
         self._laws: list[Any] = problem.materials
         F = problem.bodies.F
@@ -86,9 +92,39 @@ class History(given.Sealed):
         self._records.cut(problem.progress.steps - self._first - 1)
         self._places[len(self._records) :] = [_places(problem)]
         taken = problem.progress.taken
-        self._led += [one for one, *_ in taken.led if all(one is not other for other in self._led)]
+        new = [one for one, *_ in taken.led if all(one is not other for other in self._led)]
+        self._led += new
+        self._led_from += [len(self._records)] * len(new)
         held = uniform(problem, taken.held)
         self._records.add(self._record(before, taken.by_id(), taken.held if held is None else held))
+
+    def check_steps(self, steps: Sequence[Step]) -> None:
+        """Refuse Steps that change what the problem is, or that begin from forces that depend on its state (to be agreed on).
+
+        Raises:
+            InputError: names what is not recorded.
+        """
+        locked = {bolt for step in steps for bolt, force in step.preload.items() if force is None or bolt.locked}
+        for wrong, what in (
+            (
+                any(step.bcs is not None or step.contacts or step.begin is not None for step in steps),
+                "conditions, contacts or begin=",
+            ),
+            (self.problem.linear is not None, "equations or couplings, whose ramps each of them begins"),
+            (
+                any(as_law(contact.friction).field != 0.0 for step in steps for contact in step.offset),
+                "offset= of contacts with friction",
+            ),
+            (
+                any(bolt in locked and force is not None and step.ramp for step in steps for bolt, force in step.preload.items()),
+                "preloads of locked sections, ramped from the force that these carry: expected ramp=False",
+            ),
+        ):
+            if wrong:
+                raise InputError(f"the problem is being recorded, and no history has derivatives through Steps with {what}")
+        self._by_function += [
+            c for step in steps if isinstance(step.loads, Mapping) for c, end in step.loads.items() if callable(end)
+        ]
 
     def note_start(self) -> None:
         """Record the initial state of a motion, and its first acceleration."""
@@ -156,6 +192,8 @@ class History(given.Sealed):
                 begun = begun or functionals[k] is not None
                 if begun:
                     record = self._records[k]
+                    none = {id(one): 0.0 for one, first in zip(self._led, self._led_from) if k < first}
+                    record = replace(record, shares=none | record.shares)
                     self._place(record)
                     sweep.pass_back(record, functionals[k])
             sweep.begin(record)
@@ -195,7 +233,7 @@ class History(given.Sealed):
                         f"controls[{k}] is the shape, with which the friction of contact '{varied[0]}', a function of place, changes: "
                         "there is no derivative by it; expected a number"
                     )
-                if isinstance(m, fem.Constant) and callable(load.get(m)):
+                if isinstance(m, fem.Constant) and (callable(load.get(m)) or any(m is one for one in self._by_function)):
                     raise InputError(
                         f"controls[{k}] is set by a function of the load factor: expected a Constant that is not, as one by which it is "
                         "multiplied in the residual"

@@ -57,7 +57,7 @@ def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
         if problem.load is not None:
             raise InputError("the problem has a load, which its steps do not use: leave load out, and give the steps their loads")
         if problem.history is not None:
-            raise InputError("the problem is being recorded, and Steps change what it is: record the load steps of one load")
+            problem.history.check_steps(steps)
         for i, step in enumerate(steps):
             _check(problem, step, f"step {i + 1}" + (f", '{step.name}'" if step.name else ""))
     bcs = [bc for conditions in (problem.bodies.bcs, *(step.bcs or () for step in steps)) for bc in conditions]
