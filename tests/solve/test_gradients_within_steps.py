@@ -218,7 +218,7 @@ def test_from_where_nodes_were_free():
         if step.step == "hold" and step.factor < 1.0:
             refused(
                 uem.InputError,
-                ("the Dirichlet value of x at", "on its way"),
+                ("the Dirichlet value of x at", "is being ramped"),
                 lambda: uem.gradient(problem, s.J, s.constants["E"]),
             )
     assert np.isfinite(uem.gradient(problem, s.J, s.constants["E"])[0])
