@@ -124,6 +124,11 @@ def equation(s, **how):
     return {"contacts": [pressing(s)], "equations": [one]}
 
 
+def mean(s, **how):
+    """The lower side of the upper block has a given mean motion along the contact."""
+    return {"contacts": [pressing(s)], "equations": [uem.MeanMotion(s.b.high, (1, 0), b=constant(s, "mean motion", 0.03))]}
+
+
 def points(s, **how):
     """A force and a spring at nodes."""
     force = constant(s, "force at a node", [0.01, -0.005])
@@ -138,6 +143,10 @@ def place(s, *x):
 
 def sprung(one):
     return [uem.Spring(None, one, 0.4, points=((0.5, 1.6), (0.5, 1.2)))]
+
+
+def sliding(one):
+    return [uem.Slider(None, one, (0.5, 1.2), (0.2, 1.0))]
 
 
 def hinged(one):
@@ -160,7 +169,7 @@ def change_of(s, name, control):
         return wave(s.b.V, 0.02)
     if isinstance(control, fem.Function):
         return wave(control.function_space, 0.2)
-    size = {"force": 0.02, "E": 0.3, "friction": 0.01, "shortening": 0.02}.get(name, 0.01)
+    size = {"force": 0.02, "E": 0.3, "friction": 0.01, "shortening": 0.02, "mean motion": 0.03}.get(name, 0.01)
     shape = np.shape(control.value) if isinstance(control, fem.Constant) else control.shape(s.g)
     return size * np.linspace(1.0, 0.6, int(np.prod(shape))).reshape(shape)
 
@@ -227,6 +236,8 @@ FEATURES = {
     "coupling, led": (led, {}, (*FREE, *MOTION, "offset")),
     "coupling, led, friction": (led, {"friction": 0.3}, (*FREE, *MOTION)),
     "equation": (equation, {}, (*ALL, "b of the equation", "offset", "X")),
+    "mean motion": (mean, {}, (*ALL, "mean motion", "offset")),
+    "coupling, slider": (coupling, {"joints": sliding}, (*FREE, *LOADS)),
     "force and spring at nodes": (points, {}, (*ALL, "force at a node", "offset", "X")),
 }  # fmt: skip
 NEEDS_HISTORY = ("tie, friction beside it", "preload, locked", "coupling, led, friction")
@@ -362,16 +373,13 @@ def after(s, **how):
     return {"contacts": [uem.Contact(s.b.high, s.b.low, tied="after")]}
 
 
-def mean(s, **how):
-    return {"contacts": [pressing(s)], "equations": [uem.MeanMotion(s.b.high, (1, 0))]}
-
-
 #: What is refused: feature, options, control, words of the refusal, and whether it is one of a history.
 REFUSED = {
     "ties made later": (after, {}, "E", "tied between steps", True),
     "the shape, ties by mortar": (tie, {"coupling": "mortar"}, "X", "ties by mortar", False),
     "the shape, ties of hexahedra": (tie, {"cell": "hexahedron", "sizes": (2, 3)}, "X", "ties of hexahedra", False),
     "the shape, a section without axis": (preload, {}, "X", "expected an axis", False),
+    "the shape, mean motions": (mean, {}, "X", "with a MeanMotion", False),
     "the shape, couplings": (led, {}, "X", "by the shape with couplings", False),
     "the offset of a tie": (tie, {}, "offset", "which is tied", False),
     "a locked preload without its history": (preload, AXIS | {"locked": True}, "E", "depends on earlier steps", False),
