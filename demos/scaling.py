@@ -29,14 +29,8 @@ Options:
 # those that it has. Numbers of a list are parted by commas.
 
 # %%
-import json
-import shutil
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import common
 import numpy as np
@@ -44,6 +38,7 @@ import ufl
 from common import comm
 from dolfinx import fem
 from benchmarks import collectives
+from benchmarks.apart import run_on
 from benchmarks.traffic import Surfaces, plates, search_traffic
 
 import uem_dolfinx as uem
@@ -209,36 +204,8 @@ def here(dofs: int, sizes: str, searches: str, counted: int) -> dict[str, list]:
 # %%
 def apart(ranks: int, **options: object) -> dict[str, list]:
     """Results of this script on so many ranks, in a process of its own."""
-    mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
-    if mpiexec is None:
-        raise RuntimeError(
-            f"no mpiexec beside {sys.executable} or on the PATH: install one, or call this script with --where here"
-        )
-    environment = common.outside_mpi()
-    # Open MPI 4 and 5: more ranks than cores, none of them bound to the cores of another run
-    environment |= {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
-    environment |= {"OMPI_MCA_hwloc_base_binding_policy": "none", "PRTE_MCA_hwloc_default_binding_policy": "none"}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "figures.json"
-        if options.get("counted"):
-            environment |= collectives.environment(mpiexec, Path(folder))
-        options = {
-            "where": "here",
-            "json": file,
-            "runs": args.runs,
-            "dofs": 0,
-            "plates": "",
-            "searches": "",
-            "counted": 0,
-        } | options
-        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-        command = [mpiexec, "-n", str(ranks), sys.executable, str(Path(__file__).resolve()), *words]
-        done = subprocess.run(command, env=environment | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
-        if done.returncode:
-            raise RuntimeError(f"{' '.join(command)} failed:\n{done.stdout[-2000:]}{done.stderr[-4000:]}")
-        if args.verbose:
-            print(done.stdout, flush=True)
-        return json.loads(file.read_text(encoding="utf-8"))
+    parts = {"runs": args.runs, "dofs": 0, "plates": "", "searches": "", "counted": 0} | options
+    return run_on(ranks, __file__, counting=bool(parts["counted"]), verbose=args.verbose, **parts)
 
 
 # %%

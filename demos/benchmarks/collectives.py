@@ -1,4 +1,4 @@
-"""How many collective calls of MPI each stage of a solve makes, by a library that is loaded before MPI's and counts them."""
+"""What each stage of a solve calls and sends by MPI, counted by a library that is loaded before MPI's."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import ctypes
 import os
 import shutil
 import subprocess
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from uem_dolfinx import log
 
@@ -34,20 +36,38 @@ def counts() -> bool:
     return LIBRARY in os.environ
 
 
+#: What is counted, in the order of the library's enumeration.
+KINDS = ("collectives", "reduced_bytes", "told_bytes", "row_bytes", "sent_bytes", "messages")
+
+
 @contextmanager
 def counted() -> Iterator[Counter[str]]:
     """Collective calls of this rank in the block, by stage, those of stages within it aside; the rest is ``"other"``."""
-    library = ctypes.CDLL(os.environ[LIBRARY])
-    library.collectives.restype = ctypes.c_long
     found: Counter[str] = Counter()
-    #: Stages that are open, with the calls before what of them has not been counted yet.
-    open_stages = [["other", library.collectives()]]
+    with traffic() as stages:
+        yield found
+    found.update({stage: int(counts[0]) for stage, counts in stages.items()})
+
+
+@contextmanager
+def traffic() -> Iterator[dict[str, np.ndarray]]:
+    """Counts of each of ``KINDS`` of this rank in the block, by stage as in ``counted``."""
+    library = ctypes.CDLL(os.environ[LIBRARY])
+    found: defaultdict[str, np.ndarray] = defaultdict(lambda: np.zeros(len(KINDS), np.int64))
+
+    def counts() -> np.ndarray:
+        now = (ctypes.c_long * len(KINDS))()
+        library.traffic(now)
+        return np.array(now)
+
+    #: Stages that are open, and the counts up to which they have been told.
+    open_stages, before = ["other"], counts()
 
     def take() -> None:
-        stage, before = open_stages[-1]
-        now = library.collectives()
-        found[stage] += now - before
-        open_stages[-1][1] = now
+        nonlocal before
+        now = counts()
+        found[open_stages[-1]] += now - before
+        before = now
 
     class Counting(timer):  # type: ignore[misc, valid-type]
         def __init__(self, name: str):
@@ -56,14 +76,13 @@ def counted() -> Iterator[Counter[str]]:
 
         def __enter__(self) -> Any:
             take()
-            open_stages.append([self._stage, library.collectives()])
+            open_stages.append(self._stage)
             return super().__enter__()
 
         def __exit__(self, *error: Any) -> Any:
             done = super().__exit__(*error)
             take()
             open_stages.pop()
-            open_stages[-1][1] = library.collectives()
             return done
 
     log.Timer = Counting  # type: ignore[attr-defined]
