@@ -37,8 +37,8 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Adaptation", "Adhesion", "Balance", "Ball", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
-    "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Deck", "Dynamics", "Elastic",
-    "Energies", "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "ErrorLimit", "Exponential", "FinitePlasticity",
+    "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Deck", "Dissipation", "Dynamics",
+    "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "ErrorLimit", "Exponential", "FinitePlasticity",
     "FloatingBodyError", "FrictionError", "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError",
     "InvertedElementError", "Leak", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeanMotion", "MeshError",
     "MissingBackendError", "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError",
@@ -111,6 +111,7 @@ from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.steps.dissipation import Dissipation
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
 

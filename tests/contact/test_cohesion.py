@@ -330,3 +330,43 @@ def test_damage_in_result_files(folder):
         assert highest(COMM, np.abs(results.function(name).x.array)) == pytest.approx(
             highest(COMM, np.abs(field.x.array)), rel=1e-6
         )
+
+
+def test_flexure_that_snaps_back():
+    """End-notched flexure under dead load: both load and displacement fall while the crack grows at its energy release rate, to 1 %."""
+    L, h, E, nu, G, crack = 100.0, 5.0, 70e3, 0.3, 1.0, 50.0
+    sizes = {"length": 2 * L, "crack": crack, "middle": L, "size": 1.25, "n": 2}
+    mesh, tags = uem.read_gmsh(uem.example_mesh("delamination"), COMM, gdim=2, parameters=sizes)
+    V = uem.function_space(mesh, 2, (2,))
+    u, v, P = fem.Function(V), ufl.TestFunction(V), fem.Constant(mesh, (0.0, 0.0))
+    law = uem.Cohesive(40.0, 0.5, shear_energy=G, mixed=uem.BenzeggaghKenane(2.0))
+    bond = uem.Contact(tags["upper_bond"], tags["lower_bond"], cohesion=law, sliding="small")
+    free = uem.Contact(tags["upper_crack"], tags["lower_crack"], sliding="small")
+    bcs = [uem.dirichlet(V, tags["lower_left_corner"], 1), uem.dirichlet(V, tags["lower_right_corner"])]
+    problem = uem.UnitedProblem(
+        uem.LinearElastic(E, nu, kind="plane_strain").residual(u, v) * ufl.dx, u, bcs=bcs, contacts=[bond, free],
+        points=[uem.PointLoad(tags["upper_middle"], P)], load={P: (0.0, -160.0)}, petsc_options_prefix="cohesion_",
+    )  # fmt: skip
+    node = fem.locate_dofs_topological(V, 0, tags["upper_middle"].entities)
+    owned, stiff, rows = node[node < V.dofmap.index_map.size_local], E / (1 - nu**2), []
+    for step in uem.load_steps(problem, 15, arc_length=uem.Dissipation(2.5)):
+        force, d = 160.0 * step.factor, -COMM.allreduce(u.x.array[2 * owned + 1].sum())
+        shears = 0.3 * L / (E / (2 * (1 + nu)) * h)
+        a = (((d / force - shears) * 8 * stiff * h**3 - 2 * L**3) / 3) ** (1 / 3)
+        rows.append((force, d, 9 * force**2 * a**2 / (16 * stiff * h**3) / G, step.newton_iterations))
+        if len(rows) == 14:
+            break
+    forces, d, rates, iterations = np.array(rows).T
+    peak = int(d.argmax())
+    assert peak < 11 and (np.diff(forces[peak:]) < 0.0).all() and (np.diff(d[peak:]) < 0.0).all()
+    assert np.abs(rates[peak + 1 :] - 1.0).max() < 0.01 and iterations.max() < 10
+
+
+def test_dissipation_refuses_other_laws():
+    """Laws whose dissipation load and displacement do not measure are named."""
+    for words, more in (("viscosity", {"viscosity": 0.1}), ("unloading", {"unloading": "plastic"})):
+        b = blocks(COMM, "quadrilateral", 2, 3)
+        contact = uem.Contact(b.high, b.low, cohesion=uem.Cohesive(1.0, 0.01, **more), sliding="small", name="bond")
+        problem = pulled(b, lambda s: 0.0 * direction(2, 0.0), [contact])
+        refused(uem.InputError, words, lambda problem=problem: next(uem.load_steps(problem, 2, arc_length=uem.Dissipation(1.0))))
+    refused(uem.InputError, "energy", lambda: uem.Dissipation(0.0))

@@ -78,6 +78,7 @@ class Progress:
         factor: load factor reached in it.
         start: displacement at its beginning ``(n_local incl. ghosts,)``; with arc lengths at the beginning of its last step.
         reach: arc length of the whole call, extrapolated from its first step; 0 without arc lengths.
+        dissipating: dissipated part of the energy of the last step, see ``Dissipation``.
         control: length of its steps.
         interruption: signals that are noted during steps.
         end: ends the run on a signal of a given number, once the problem is in its last converged state.
@@ -99,6 +100,7 @@ class Progress:
     factor: float = 0.0
     start: Array = field(default_factory=lambda: np.zeros(0))
     reach: float = 0.0
+    dissipating: float = 0.0
     control: StepControl = field(default_factory=StepControl)
     interruption: Interruption | None = None
     end: Callable[[int], NoReturn] = lambda number: end_run(number, "the problem is in its last converged state")
@@ -143,7 +145,7 @@ class Progress:
         self._calls += 1
         if self._calls > self.ramp:
             self.ramp, self.factor, self.start = self._calls, 0.0, np.array(displacement)
-            self.reach, self.began = 0.0, self.taken.now()
+            self.reach, self.dissipating, self.began = 0.0, 0.0, self.taken.now()
             self.control = StepControl()
         if self._calls == self.ramp:
             self.control.begin(1.0 / steps)
@@ -181,6 +183,7 @@ class Progress:
         if ramped:
             ramp = [self.ramp, *map(list, self.left.items())] if self.left else self.ramp
             load = {"load ramp": ramp, "load factor": self.factor, "arc length": self.reach}
+            load |= {"dissipating": self.dissipating}
             load |= {
                 "name of the step": self.step,
                 "loads at its beginning": self.loads,
@@ -194,6 +197,7 @@ class Progress:
         self.resumed += 1
         if start is not None:
             ramp, self.factor, self.reach = kept["load ramp"], kept["load factor"], kept["arc length"]
+            self.dissipating = kept["dissipating"]
             self.ramp, *left = ramp if isinstance(ramp, list) else [ramp]
             self.left = dict(left)
             self.start, self.step, self.loads = np.array(start), kept["name of the step"], kept["loads at its beginning"]

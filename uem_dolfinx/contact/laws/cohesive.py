@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.laws.bilinear import Bilinear
 from uem_dolfinx.contact.laws.exponential_softening import ExponentialSoftening
 from uem_dolfinx.contact.laws.mixed_mode import MixedMode
@@ -148,7 +148,7 @@ class Cohesive(given.Sealed):
         beyond = size.real > (strength / self.stiffness).real
         return np.where(beyond, 1.0 - t / (self.stiffness * np.where(beyond, size, 1.0)), 0.0)
 
-    def respond(self, w: Array, normal: Array, kept: Response, passed: Array | float) -> Response:
+    def respond(self, w: Array, normal: Array, kept: Response, passed: Array | float, goes_on: Bools | bool = False) -> Response:
         """Tractions on openings.
 
         Args:
@@ -156,6 +156,7 @@ class Cohesive(given.Sealed):
             normal: unit normals along which surfaces open ``(n, gdim)``.
             kept: of the last step.
             passed: time, or part of the load factor, since then, one or ``(n,)``.
+            goes_on: whether the tangent is that of growing damage although it has not grown ``(n,)``; with unloading to the origin.
         """
         plastic = self.unloading == "plastic"
         e = w - kept.permanent if plastic else w
@@ -180,8 +181,8 @@ class Cohesive(given.Sealed):
         if plastic:
             return self._yield(e, m, P, size, share, slopes, kept)
         damage, slope = slopes(self._damage)
-        grows = damage > kept.damage
-        damage = np.where(grows, damage, kept.damage)
+        grows = (damage > kept.damage) | goes_on
+        damage = np.maximum(damage, kept.damage)
         follows = passed / (passed + self.viscosity) if self.viscosity > 0.0 else 1.0
         delayed = (1.0 - follows) * kept.delayed + follows * damage
         left = K * (1.0 - delayed)

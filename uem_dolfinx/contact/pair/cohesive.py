@@ -31,9 +31,9 @@ MOST_SWINGS = 6
 #: After so many exchanges of contactors in one linearised problem all bonds get it, which makes the problem convex.
 #: [bound; exchanges; -]
 MOST_EXCHANGED = 4
-#: Columns of the state: damage, delayed damage and the load factor or time that it belongs to; the permanent opening and the normal of
-#: the next step follow.
-DAMAGE, DELAYED, AT, PERMANENT = range(4)
+#: Columns of the state: damage, delayed damage, the load factor or time that it belongs to, and whether damage has grown in the last step;
+#: the permanent opening and the normal of the next step follow.
+DAMAGE, DELAYED, AT, GREW, PERMANENT = range(5)
 
 
 class CohesiveInterface(Interface):
@@ -58,6 +58,10 @@ class CohesiveInterface(Interface):
         self._exchanged = 0
         #: Branch of the law of each bond at the last placement of this step, and how often it has changed ``(n,)``.
         self._branch, self._changes = np.zeros(0, np.int64), np.zeros(n, np.int64)
+        #: Openings at the first placement of this step ``(n, gdim)``.
+        self._first: Array | None = None
+        #: Whether bodies may come down to another equilibrium, by bonds with the stiffness without growth; not along an arc.
+        self.may_jump = True
         #: Parameter of friction of surfaces without cohesion ``(n,)``.
         self._mu: Array = np.zeros(n) if self.friction is None else self.friction.value
 
@@ -86,7 +90,11 @@ class CohesiveInterface(Interface):
         offsets = self._contact._offsets
         # what an offset takes up is no opening
         taken = 0.0 if offsets is None else offsets.declared[:, None] * normal
-        now = self._law.respond(self._bonds.openings() - taken, normal, kept, passed)
+        w = self._bonds.openings() - taken
+        self._first = w if self._first is None else self._first
+        # as long as bonds have not moved, those that have grown in the last step are expected to grow on
+        goes_on = (before[:, GREW] > 0.0) & (w == self._first).all(axis=1)
+        now = self._law.respond(w, normal, kept, passed, goes_on)
         share = np.where(self._bonds.rows.share > 0.0, self._bonds.rows.share, 1.0)
         area = self._bonds.bonded_areas(self._contact._areas)[:, None]
         self._bonds.multipliers = -area * now.traction / share
@@ -94,7 +102,9 @@ class CohesiveInterface(Interface):
         self._secant, tangent = ((area / share)[:, :, None] * part / share[:, None, :] for part in (now.secant, now.tangent))
         self._tangent = np.where(self._swings(now, before)[:, None, None], self._secant, tangent)
         self._exchanged = 0
-        states = np.column_stack([now.damage, now.delayed, np.full(len(area), at), now.permanent, normal])
+        states = np.column_stack(
+            [now.damage, now.delayed, np.full(len(area), at), now.damage > before[:, DAMAGE], now.permanent, normal]
+        )
         self.trial = replace(self.trial, cohesion=states, bond=self._bonds.multipliers)
 
     def _swings(self, now: Response, before: Array) -> Bools:
@@ -102,14 +112,14 @@ class CohesiveInterface(Interface):
         here = np.where(now.damage >= 1.0, 2, np.where(now.damage > before[:, DAMAGE], 1, 0))
         moved = here != self._branch if len(self._branch) else np.zeros(len(here), bool)
         self._changes, self._branch = self._changes + moved, here
-        return self._changes > MOST_SWINGS
+        return (self._changes > MOST_SWINGS) & self.may_jump
 
     def exchange(self, violated: Violations) -> None:
         """See ``Interface``; where exchanges do not end, growing damage has made the problem indefinite (collective)."""
         super().exchange(violated)
         self._exchanged += 1
-        if self._exchanged == MOST_EXCHANGED:
-            self._tangent, self._changes = self._secant, np.full(len(self.nodes), MOST_SWINGS + 1)
+        if self._exchanged == MOST_EXCHANGED and self.may_jump:
+            self._tangent = self._secant
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """Terms of friction, and the stiffness of the bonds; see ``Interface``."""
@@ -155,18 +165,20 @@ class CohesiveInterface(Interface):
         if self.trial.cohesion is not None:
             g = self.config.gdim
             told = np.column_stack([self.trial.cohesion[:, :-g], self.projection.normal])
-            self.trial = replace(self.trial, cohesion=told)
+            self.trial, self._first = replace(self.trial, cohesion=told), None
         super().commit()
         self._rub()
 
     def restore(self) -> None:
         """See ``Interface``."""
         super().restore()
+        self._first = None
         self._branch, self._changes = np.zeros(0, np.int64), np.zeros(len(self.nodes), np.int64)
 
     def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
         """See ``Interface``."""
         super().remember(memory)
+        self._first = None
         if self.friction is not None:
             self.friction.set(self.friction.limits.law, self._rubbing(self._mu))
 

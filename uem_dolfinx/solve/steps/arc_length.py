@@ -1,14 +1,16 @@
 """Load steps of given arc length: the load factor is an additional unknown, to follow paths past limit points under dead load.
 
-    Q'KP dq = Q'(r - K c) - dlam Q'F_lam,    t . (u + du - u0) = s,    F_lam = dF/dlam
+    Q'KP dq = Q'(r - K c) - dlam Q'F_lam,    a . (u + du - u0) + b (lam + dlam - lam0) = 1,    F_lam = dF/dlam
 
-with t the direction of the last step: Riks' method with a constraint plane, solved with a single constrained matrix and two right-hand
-sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are measured in the displacement only: other
-fields, with other units, have no part in t.
+Riks' method is ``a = t / s``, ``b = 0`` with t the direction of the last step and s its length: a constraint plane, solved with a single
+constrained matrix and two right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are
+measured in the displacement only: other fields, with other units, have no part in t. ``Dissipation`` adds a dissipated energy.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +24,7 @@ from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.steps.dissipation import Dissipation, refuse_other_laws
 from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, Iteration, IterationState, LinearisedProblem
 from uem_dolfinx.solve.united.rows import BodyState
 from uem_dolfinx.solve.united.system import BodySystem
@@ -53,9 +56,10 @@ class ArcLength:
         self.factor = 0.0
         #: Number of the displacement's components on this rank, which come first in vectors.
         self._n = problem.config.n_owned * problem.config.gdim
-        self._direction, self._length = np.zeros(self._n), 0.0
-        #: Displacement at the beginning of the step.
-        self._start = self._bodies.displacement()
+        #: Direction of the last step over the length of this one, and energy to dissipate, or infinity without.
+        self._direction, self._energy = np.zeros(self._n), np.inf
+        #: Displacement and load factor at the beginning of the step.
+        self._start, self._from = self._bodies.displacement(), 0.0
         #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
         self._change, self._slope = 0.0, problem.config.unknowns.vector()
         self.begin_step, self.end_step = self._system.begin_step, self._system.end_step
@@ -63,16 +67,17 @@ class ArcLength:
         self.complete, self.reduced_residual = self._system.complete, self._system.reduced_residual
         self.return_to_targets = self._system.return_to_targets
 
-    def begin(self, factor: float, direction: Array, length: float) -> None:
+    def begin(self, factor: float, direction: Array, length: float, energy: float = np.inf) -> None:
         """Begin a step.
 
         Args:
             factor: committed load factor.
-            direction: of unit length over all ranks, at the displacement's owned components.
+            direction: of unit length over all ranks, at the displacement's owned components; shorter the more the last step dissipated.
             length: of the displacement increment along it.
+            energy: to dissipate where direction is 0; infinity without a control by energy.
         """
-        self._direction, self._length = direction, length
-        self._start = self._bodies.displacement()
+        self._direction, self._energy = direction / length, energy
+        self._start, self._from = self._bodies.displacement(), factor
         self._change = 0.0
         self._set(factor)
 
@@ -80,14 +85,24 @@ class ArcLength:
         self.factor = factor
         self._problem.set_load(factor)
 
-    def _along(self, way: PETSc.Vec) -> float:
-        """Component of an increment in the step's direction (collective)."""
-        return float(reduced(self._problem.comm, self._direction @ way.array_r[: self._n]))
+    def _over(self, values: Array) -> float:
+        """Sum over all ranks of products with components of the displacement ``(n,)`` (collective)."""
+        return float(reduced(self._problem.comm, values))
+
+    def dissipated(self, way: Array, change: float) -> float:
+        """Energy ``(lam0 f . way - change f . u0) / 2`` of an increment, for ``f = -F_lam`` (collective)."""
+        f = -self._slope.array_r[: self._n]
+        return 0.5 * self._over(self._from * (f @ way) - change * (f @ self._start.array_r[: self._n]))
+
+    def _along(self, way: PETSc.Vec, change: float) -> float:
+        """``a . way + b change`` of an increment in displacement and load factor (collective)."""
+        u = way.array_r[: self._n]
+        return self._over(self._direction @ u) + self.dissipated(u, change) / self._energy
 
     @property
     def _missing(self) -> float:
-        """Missing displacement in the step's direction (collective)."""
-        return self._length - self._along(self._bodies.displacement() - self._start)
+        """Missing part of the step (collective)."""
+        return 1.0 - self._along(self._bodies.displacement() - self._start, self.factor - self._from)
 
     def place(self) -> None:
         """Project the contactors of displaced bodies, whose load factor has changed with the displacement."""
@@ -98,7 +113,7 @@ class ArcLength:
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
         """The targets of the contactors and their equations; the state is closed only if the arc has its length."""
         state = self._system.assemble_constraints(in_equilibrium)
-        there = abs(self._missing) <= ON_THE_PLANE * self._length
+        there = abs(self._missing) <= ON_THE_PLANE
         return replace(state, closed=state.closed and there)
 
     def linearise(self, state: IterationState, iteration: int | None) -> LinearisedProblem:
@@ -130,10 +145,10 @@ class ArcLength:
         free, by_load = (system.complete(one, system.solve(one, accuracy, None)) for one in both)
         still = load.duplicate()
         still.set(0.0)
-        along = self._along(by_load.du - system.move(state, still))
+        along = self._along(by_load.du - system.move(state, still), 1.0)
         if along == 0.0:
             raise ConvergenceError("the load does not move the bodies in the direction they went: take smaller steps")
-        self._change = (self._missing - self._along(free.du)) / along
+        self._change = (self._missing - self._along(free.du, 0.0)) / along
         dq, rhs = free.dq + self._change * by_load.dq, problem.rhs + self._change * load
         return Increment(dq, system.move(state, dq), rhs, free.linear_iterations + by_load.linear_iterations, free.left)
 
@@ -151,6 +166,7 @@ class AlongArc:
 
     Args:
         problem: the problem.
+        by: energy to dissipate in a step; None for the arc length alone.
 
     Attributes:
         tried: intended length of the last step, relative to the arc of all nominal steps.
@@ -159,7 +175,7 @@ class AlongArc:
         loops: number of Newton loops that make a step.
     """
 
-    def __init__(self, problem: UnitedProblem):
+    def __init__(self, problem: UnitedProblem, by: Dissipation | None = None):
         if not isinstance(problem.system, BodySystem):
             raise InputError("arc_length needs contact by elimination: leave out the problem's method")
         for contact in problem.contacts:
@@ -170,7 +186,9 @@ class AlongArc:
                 )
         if not problem.config.moves:
             refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out")
-        self._problem, self._arc = problem, ArcLength(problem)
+        if by is not None:
+            refuse_other_laws(problem.contacts)
+        self._problem, self._arc, self._by = problem, ArcLength(problem), by
         self.tried, self.most, self.longer, self.loops = 0.0, MOST_STEPS, True, 1
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
@@ -188,9 +206,13 @@ class AlongArc:
             factor, iterations = self.tried, self._by_load(self.tried)
         else:
             way = self._way(before - progress.start)
-            self._arc.begin(done, way / self._size(way), progress.reach * self.tried)
-            iterations = problem.attempt(along=self._arc)
+            energy = np.inf if self._by is None else self._by.energy * self.tried / progress.control.nominal
+            self._arc.begin(done, (1.0 - progress.dissipating) * way / self._size(way), progress.reach * self.tried, energy)
+            with _without_jumps(problem):
+                iterations = problem.attempt(along=self._arc)
             factor = self._arc.factor
+            spent = self._arc.dissipated(self._way(np.array(problem.u.x.array) - before), factor - done)
+            progress.dissipating = float(np.clip(spent / energy, 0.0, 1.0))
             _check_values(problem)
             if factor > 1.0:
                 # the last step has a given load, which is near
@@ -218,6 +240,19 @@ class AlongArc:
     def _size(self, way: Array) -> float:
         """Norm of an increment ``(n_owned * gdim,)`` (collective)."""
         return float(np.sqrt(reduced(self._problem.comm, way @ way)))
+
+
+@contextmanager
+def _without_jumps(problem: UnitedProblem) -> Iterator[None]:
+    """Let bonds keep the tangents with which the arc finds the load."""
+    bonds = [pair for pair in problem.interfaces if hasattr(pair, "may_jump")]
+    for pair in bonds:
+        pair.may_jump = False
+    try:
+        yield
+    finally:
+        for pair in bonds:
+            pair.may_jump = True
 
 
 def _check_values(problem: UnitedProblem) -> None:

@@ -16,6 +16,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
 from uem_dolfinx.solve.steps.by_error import ByError
 from uem_dolfinx.solve.steps.by_load import ByLoad
+from uem_dolfinx.solve.steps.dissipation import Dissipation
 from uem_dolfinx.solve.steps.limit_points import LimitPoint
 from uem_dolfinx.solve.steps.load_step import LoadStep
 
@@ -29,7 +30,7 @@ def load_steps(
     problem: UnitedProblem,
     steps: int | Sequence[Step] = 1,
     *,
-    arc_length: bool = False,
+    arc_length: bool | Dissipation = False,
     tolerance: float | None = None,
     estimate: Callable[[UnitedProblem], None] | None = None,
     checkpoint: Checkpoint | None = None,
@@ -42,6 +43,7 @@ def load_steps(
             its own number, between which conditions, loads, contacts and coefficients change: the load factor runs from 0 to 1 in each.
         arc_length: prescribe the load of the first step only, and its length in displacement for all other steps. The load factor is an
             unknown, which increases up to limit points and decreases beyond them, until it is 1. Dirichlet values are not ramped.
+            A ``Dissipation`` also controls the energy that damage dissipates in a step, to follow paths that snap back.
         tolerance: shorten steps until what they change differs by less than this part from two steps of half the length, which count;
             and lengthen them where they allow it. So histories of friction and plasticity have about this error. None: no such test.
         estimate: called with the problem after every step, as ``ErrorLimit(0.05)``, which warns of errors by the mesh; or None.
@@ -65,7 +67,8 @@ def load_steps(
     check_steps(problem, checkpoint)
     several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
     with agreed(problem.comm):
-        arc_length = given.flag("arc_length", arc_length)
+        by = arc_length if isinstance(arc_length, Dissipation) else None
+        arc_length = True if by else given.flag("arc_length", arc_length)
         if several and arc_length:
             raise InputError(
                 "arc_length = True does not go with a list of Step: follow a path by load_steps(problem, n, arc_length=True)"
@@ -79,7 +82,7 @@ def load_steps(
             raise InputError("the problem is being recorded: leave tolerance out, and take as many steps as a run with it took")
         n = 0 if several else given.count("steps", steps, "or give a list of Step")
     given.kind("estimate", estimate, estimate is None or callable(estimate), "an ErrorLimit, or another function of the problem")
-    given.alike(problem.comm, "load_steps", steps=n, arc_length=arc_length, tolerance=tolerance)
+    given.alike(problem.comm, "load_steps", steps=n, arc_length=repr(by or arc_length), tolerance=tolerance)
     if isinstance(steps, Sequence):
         from uem_dolfinx.solve.steps.stages import check_stages
 
@@ -92,7 +95,7 @@ def load_steps(
         if arc_length:
             from uem_dolfinx.solve.steps.arc_length import AlongArc
 
-            way = AlongArc(problem)
+            way = AlongArc(problem, by)
         made, total = _load_steps(problem, steps, way), steps
     if estimate is not None:
         made = _estimated(problem, made, estimate)
