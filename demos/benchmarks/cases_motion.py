@@ -39,14 +39,14 @@ class Motion:
         assert problem.dynamics is not None
         self._dynamics = problem.dynamics
         self._stored = forms.form(scene.material.energy(scene.u) * ufl.dx)
-        self._start_energy, self._start_momentum = self._energy(), self._dynamics.momentum()
+        self.start_energy, self._start_momentum = self._energy(), self._dynamics.momentum()
 
     def _energy(self) -> float:
         return self._dynamics.kinetic_energy() + forms.assemble_scalar(self._stored, COMM)
 
     def gained(self) -> float:
         """Energy won since the start, as part of that at the start; negative if lost (collective)."""
-        return self._energy() / self._start_energy - 1
+        return self._energy() / self.start_energy - 1
 
     def impulse(self) -> float:
         """Momentum upwards won since the start (collective)."""

@@ -36,7 +36,8 @@ def test_names_are_told_apart_on_the_command_line():
         "corner on edge",
         "beside 2D finite",
     ]
-    + ["cylinder averaged", "cylinder falls"],
+    + ["cylinder averaged", "cylinder falls", "explicit half the wave speed", "massy explicit E and mass 1 : 1e6"]
+    + [pytest.param(name, marks=pytest.mark.slow) for name in ("explicit layer 0.01", "massy explicit layer 0.01")],
 )
 def test_correct(name):
     cell = judge(CASES[name], UNITED)

@@ -19,6 +19,13 @@ EASY = 6
 #: What is left to the end, or to a multiple of the nominal length, is rounding below this part of it.
 #: [convention; nominal length; test_thresholds_motion.py::test_no_step_for_rounding]
 REMAINDER = 1e-9
+#: Contacts may give the bodies this part of the energies at work in a step: of the largest kinetic energy and of what contact forces hold
+#: in the surfaces that they press.
+#: [convention; energies at work; test_thresholds_motion.py::test_energy_given]
+MOST_GIVEN = 2e-3
+#: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
+#: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
+SHORTEST_GIVEN = 1.0 / 128
 
 
 #: Errors that a shorter step may avoid.
@@ -40,11 +47,12 @@ class StepControl:
         largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
         largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
         due: number of the step after which explicit steps find the critical step anew.
+        resolved: bound on the length of explicit steps that resolve contacts on a stiff surface.
     """
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
-        self._cuts, self._read, self._longest_before, self.due = 0, False, np.inf, 0
+        self._cuts, self._read, self._longest_before, self.due, self.resolved = 0, False, np.inf, 0, np.inf
 
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
@@ -94,13 +102,18 @@ class StepControl:
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers for a checkpoint, by name."""
         kept = {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
-        return kept | {"nominal length": self.nominal, "largest speed": self.largest_speed, "critical step due": self.due}
+        return kept | {
+            "nominal length": self.nominal,
+            "largest speed": self.largest_speed,
+            "critical step due": self.due,
+            "resolved step": self.resolved,
+        }
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
         # files of earlier versions lack these
-        kept = {"largest speed": 0.0, "critical step due": 0} | kept
-        self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due = (
+        kept = {"largest speed": 0.0, "critical step due": 0, "resolved step": np.inf} | kept
+        self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due, self.resolved = (
             kept[name] for name in self.to_checkpoint()
         )
         self._read, self._longest_before = True, self.longest

@@ -124,6 +124,7 @@ class StepperWithMass(ExplicitStepper):
             problem.restore()
             raise
         a = self._accelerations()
+        self._refuse_long(dt, a, ())
         half, kick = (problem.u.x.array[:n] - begin) / dt, 0.5 * dt * a
         # contact takes part in the change of the velocity, and the next step starts with the velocity in its middle all the same
         taken = self._along_contact(kick) if history[-1].active or problem.linear is not None else kick

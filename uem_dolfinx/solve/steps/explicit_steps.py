@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
-from uem_dolfinx.errors import InputError, UEMError
+from uem_dolfinx.errors import InputError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import gathered
 from uem_dolfinx.solve.steps.time_step import TimeStep, events, touching
 
 #: What is left to the end is rounding below this part of a step.
@@ -41,8 +39,9 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     problem.set_load(dynamics.time)
     if not dynamics.accelerated:
         stepper.begin()
-    length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), _pattern(problem)
+    length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), stepper.pattern()
     control.begin(length)
+    stepper.steps_to_check(length)
     if not resumed:
         # bodies that touch deform from the first step on
         control.due = control.number + 1
@@ -56,6 +55,9 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
             problem.set_load(dynamics.time)
             problem.restore()
             stepper.surface.kept = False
+            if isinstance(error, StepAccuracyError):
+                # until the critical step is found anew
+                length = min(length, dynamics.scheme.safety * stepper.limit)
             if control.shorten(taken, error):
                 continue
             raise
@@ -66,15 +68,10 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         # bodies that meet deform from now on
         due = not problem.bodies.linear and (number >= control.due or after != before)
         before = after
-        if due or (stepper.of_contact and (pattern := _pattern(problem)) != last):
+        if due or (pattern := stepper.pattern()) != last:
             length = _length(stepper, dt, end)
             control.due = number + stepper.steps_to_check(length)
             control.begin(length)
-
-
-def _pattern(problem: Any) -> tuple[int, ...]:
-    """Fingerprint of the active contactors (collective)."""
-    return tuple(gathered(problem.comm, np.array(zlib.crc32(b"".join(pair.united.tobytes() for pair in problem.interfaces)))))
 
 
 def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:
@@ -87,7 +84,10 @@ def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:
                 "differences; take shorter steps, or dt=None"
             )
         return dt
-    longest = dynamics.scheme.safety * critical
+    longest, control = dynamics.scheme.safety * critical, stepper.problem.step_control
+    if stepper.part < 1.0:
+        control.resolved = min(control.resolved, stepper.part * longest)
+    longest = min(longest, control.resolved)
     remainder = end - dynamics.time
     # the same on any ranks: rounding of the critical step does not change the number of steps
     length = remainder / max(np.ceil(remainder / longest - LEFT), 1.0)

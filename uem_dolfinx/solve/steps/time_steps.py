@@ -19,7 +19,7 @@ from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, Spa
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
+from uem_dolfinx.solve.step_control import MENDABLE, MOST_GIVEN, REMAINDER, SHORTEST_GIVEN, SHORTEST_LENGTH
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
 from uem_dolfinx.solve.steps.explicit_steps import explicit_steps
 from uem_dolfinx.solve.steps.load_steps import check_steps
@@ -33,16 +33,9 @@ if TYPE_CHECKING:
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
 TIME_ROUNDING = 4 * np.finfo(float).eps
-#: Contacts may give the bodies this part of the energies at work in a step: of the largest kinetic energy and of what contact forces hold
-#: in the surfaces that they press.
-#: [convention; energies at work; test_thresholds_motion.py::test_energy_given]
-MOST_GIVEN = 2e-3
 #: The error of a step over its length grows so much if the length doubles.
 #: [derived; error over length; test_accuracy_in_time.py::test_steps_are_doubled_in_time]
 ORDER_TWO = 4.0
-#: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
-#: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
-SHORTEST_GIVEN = 1.0 / 128
 
 
 def time_steps(
