@@ -19,13 +19,6 @@ EASY = 6
 #: What is left to the end, or to a multiple of the nominal length, is rounding below this part of it.
 #: [convention; nominal length; test_thresholds_motion.py::test_no_step_for_rounding]
 REMAINDER = 1e-9
-#: Contacts may give the bodies this part of the energies at work in a step: of the largest kinetic energy and of what contact forces hold
-#: in the surfaces that they press.
-#: [convention; energies at work; test_thresholds_motion.py::test_energy_given]
-MOST_GIVEN = 2e-3
-#: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
-#: [convention; nominal length; test_thresholds_motion.py::test_energy_given]
-SHORTEST_GIVEN = 1.0 / 128
 
 
 #: Errors that a shorter step may avoid.

@@ -18,10 +18,9 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.explicit.critical import highest_eigenvalue
 from uem_dolfinx.dynamics.explicit.surface import SurfaceSolver
+from uem_dolfinx.dynamics.scheme import MOST_GIVEN, SHORTEST_GIVEN
 from uem_dolfinx.errors import EnergyGivenError, MassError, StepAccuracyError
 from uem_dolfinx.parallel import gathered, reduced
-from uem_dolfinx.solve.step_control import MOST_GIVEN, SHORTEST_GIVEN
-from uem_dolfinx.solve.steps.time_step import touching
 
 #: A surface at rest makes the square of the highest frequency much larger if by more than this factor: contacts then change the step.
 #: [convention; square of the highest frequency; test_explicit.py::test_stiff_contactors_do_not_shorten_steps]
@@ -198,7 +197,7 @@ class ExplicitStepper:
             condensed = self._highest(self._stiffness)
         stiff = fixed > STIFF_SURFACE * condensed
         # closed contacts leave nothing of the surface that could be at rest
-        closed = self.of_contact and any(touching(problem))
+        closed = self.of_contact and reduced(problem.comm, int(any(pair.united.any() for pair in problem.interfaces))) > 0
         self.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
         return condensed if stiff else fixed
 

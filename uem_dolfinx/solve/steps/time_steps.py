@@ -15,11 +15,12 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.dynamics.scheme import MOST_GIVEN, SHORTEST_GIVEN
 from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.step_control import MENDABLE, MOST_GIVEN, REMAINDER, SHORTEST_GIVEN, SHORTEST_LENGTH
+from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
 from uem_dolfinx.solve.steps.explicit_steps import explicit_steps
 from uem_dolfinx.solve.steps.load_steps import check_steps
