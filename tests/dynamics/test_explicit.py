@@ -206,13 +206,13 @@ def test_a_thin_layer_at_the_wall():
 
     def squeezed(x):
         y = x[:, 1] - 0.5
-        return np.column_stack([x[:, 0], 0.5 + np.where(y < 0.25, y, np.where(y < 0.75, 0.005 + (y - 0.5), y))])
+        return np.column_stack([x[:, 0], 0.5 + np.where(y < 0.5, y, np.where(y < 1.5, 0.01 + (y - 1.0), y))])
 
-    bar = Flight(2, 20, pose=squeezed)
+    bar = Flight(2, 10, pose=squeezed)
     t, _, energy, momentum = bar.run(0.05 + 2 * 10 / 30 + 0.05)
     assert abs(energy - 1).max() < 0.03 and abs(momentum[-1] / momentum[0] + 1) < 0.07
     # two thirds of the time of the run at a fifth of the step of other cells
-    assert 400 < len(t) < 1200
+    assert 200 < len(t) < 600
 
 
 @pytest.mark.parametrize(("left", "steps"), [(3e-7, 1), (3e-6, 2)])
@@ -278,8 +278,9 @@ def test_a_plane_pushes():
 
 
 def test_a_step_that_fails():
-    """A wave that turns cells inside out ends the run with their place, in the last converged state."""
-    bar = Flight(2, 40, 100.0, 0.1, law=uem.NeoHooke)
+    """Velocities that turn cells inside out end the run with their place, in the last converged state."""
+    bar = Flight(2, 10, 0.0, 3.0, law=uem.NeoHooke)
+    bar.dynamics.velocity.x.array.reshape(-1, 2)[:, 1] = -80.0 * np.maximum(bar.problem.config.X[:, 1] - 8.0, 0.0)
     with pytest.raises((uem.InvertedElementError, uem.NotFiniteError)):
         for _ in uem.time_steps(bar.problem, end=1.0):
             pass
