@@ -14,7 +14,13 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
+from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
+
+#: Forces of a translation are rounding below this part of the magnitudes in a row of K.
+#: [derived; magnitudes in a row of K; test_linear_forces.py::test_what_resists_a_translation]
+TRANSLATION_ROUNDING = 4.0 * np.finfo(float).eps
 
 
 def explicit_forces(bodies: Any, J: ufl.Form | None) -> Callable[[PETSc.Vec], None] | None:
@@ -43,6 +49,9 @@ class LinearForces:
         #: Values of Constants and Functions at the last call, and F(0) with them; None until it is needed.
         self._values: list[Array] | None = None
         self._at_zero: Array | None = None
+        #: State of K's values, their forces in translations, and the number of nodes of each body.
+        self._state = -1
+        self._resistance = self._sizes = np.zeros(0)
 
     def assemble(self, b: PETSc.Vec) -> None:
         """Write F(u) to the owned entries of ``b``; loads that have changed since the last call take an assembly (collective)."""
@@ -60,4 +69,31 @@ class LinearForces:
             forms.assemble_vector(b, self._form)
             u[:] = present
             self._at_zero = np.array(b.array_r)
-        b.array[:] = self._at_zero + forms.product(bodies.tangent.K, bodies.displacement()).array_r
+        b.array[:] = self._at_zero + self._product()
+
+    def _product(self) -> Array:
+        """``K u (n,)``, without the rounding of each body's translation, which momentum would feel (collective)."""
+        bodies, K = self._bodies, self._bodies.tangent.K
+        config, state = bodies.config, K.stateGet()
+        body, count = find_bodies(config)
+        body, g = body[: config.n_owned], config.gdim
+        if state != self._state:
+            self._state, self._resistance = state, resistance_to_translation(K, config.unknowns)
+            self._sizes = reduced(config.comm, np.bincount(body, minlength=count).astype(float))
+        u = bodies.displacement()
+        x = u.array.reshape(-1, g)
+        sums = reduced(config.comm, np.column_stack([np.bincount(body, x[:, i], count) for i in range(g)]))
+        mean = (sums / self._sizes[:, None])[body]
+        u.array[:] -= mean.ravel()
+        return np.asarray(forms.product(K, u).array_r + (self._resistance * mean.repeat(g, axis=0)).sum(axis=1))
+
+
+def resistance_to_translation(K: PETSc.Mat, space: Nodes) -> Array:
+    """Forces of unit translations of all nodes ``(n, gdim)``, zero where they are rounding: only foundations resist (collective)."""
+    starts, _, values = K.getValuesCSR()
+    size = np.add.reduceat(np.abs(values), starts[:-1]) if len(values) else np.zeros(0)
+    forces = np.zeros((len(size), space.block))
+    for i in range(space.block):
+        unit = space.vector(np.tile(np.arange(space.block) == i, space.n_owned).astype(float))
+        forces[:, i] = forms.product(K, unit).array_r
+    return np.where(np.abs(forces) > TRANSLATION_ROUNDING * size[:, None], forces, 0.0)

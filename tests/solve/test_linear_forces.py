@@ -1,0 +1,60 @@
+"""Forces of linear bodies in explicit steps: K u without the rounding of translations."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import box, scene
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat, forms
+from uem_dolfinx.solve.bodies.linear_forces import resistance_to_translation
+
+COMM = MPI.COMM_WORLD
+
+
+def flying(foundation=0.0):
+    """Two irregular bodies in flight, on a foundation of this stiffness by volume."""
+    parts = [box("triangle", [0.0, 3.0 * k], [2.0, 3.0 * k + 1.0], [9, 6]) for k in range(2)]
+    s = scene(COMM, "triangle", parts, pose=lambda x: x + 0.02 * np.sin(7.0 * x[:, ::-1]))
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(900.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    F += fem.Constant(s.mesh, foundation) * ufl.inner(u, v) * ufl.dx
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=uem.CentralDifferences(), contactors="massy")
+    return uem.UnitedProblem(F, u, dynamics=dynamics)
+
+
+@pytest.mark.parametrize("foundation", [0.0, 1e-3, 10.0])
+def test_momentum_of_translated_bodies(foundation):
+    """Far away, internal forces add up to rounding of the strains; a foundation resists with its stiffness."""
+    problem = flying(foundation)
+    bodies, far = problem.bodies, np.array([300.0, -700.0])
+    x = problem.u.function_space.tabulate_dof_coordinates()[:, :2]
+    problem.u.x.array.reshape(-1, 2)[:] = far * (1.0 + (x[:, 1:] > 2.0)) + 1e-3 * np.sin(x)
+    for _ in range(3):
+        bodies.assemble()
+    expected = compat.create_vector(problem.u.function_space)
+    forms.assemble_vector(expected, bodies._F)
+    found, held = bodies.forces.sum(axis=0), expected.array_r.reshape(-1, 2).sum(axis=0)
+    total, held = (np.sum(COMM.allgather(part), axis=0) for part in (found, held))
+    size = np.abs(np.concatenate(COMM.allgather(bodies.forces))).max()
+    assert np.abs(total - held).max() <= 1e-9 * size + 1e-12 * np.abs(held).max()
+    if foundation == 0.0:
+        assert np.abs(total).max() <= 1e-12 * size
+
+
+@pytest.mark.parametrize("foundation", [0.0, 1e-9])
+def test_what_resists_a_translation(foundation):
+    """Rounding of K does not resist a translation; the weakest foundation that is told from it does, with its stiffness."""
+    K = flying(foundation).bodies.update_tangent()
+    found = resistance_to_translation(K, flying().config.unknowns)
+    total = np.sum(COMM.allgather(found.sum(axis=0)), axis=0)
+    if foundation == 0.0:
+        assert not found.any()
+    else:
+        assert np.abs(total / (4.0 * foundation) - 1).max() < 0.2
