@@ -197,7 +197,8 @@ class Progress:
         self.resumed += 1
         if start is not None:
             ramp, self.factor, self.reach = kept["load ramp"], kept["load factor"], kept["arc length"]
-            self.dissipating = kept["dissipating"]
+            # files of earlier versions lack it
+            self.dissipating = kept.get("dissipating", 0.0)
             self.ramp, *left = ramp if isinstance(ramp, list) else [ramp]
             self.left = dict(left)
             self.start, self.step, self.loads = np.array(start), kept["name of the step"], kept["loads at its beginning"]
