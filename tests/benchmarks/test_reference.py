@@ -18,7 +18,7 @@ def test_every_scene_is_said_on_the_page():
         own = next((f for key, f in (("deck", "decks.py"), ("closed_form", "closed_forms.py")) if key in scene), None)
         script = own or f"../../{scene['demo']}.py"
         source = (compare.HERE / script).read_text(encoding="utf-8")
-        said = f"| {scene['name']} | `" if "deck" in scene else f"[{scene['name']}]({script})"
+        said = f"[{scene['name']}]({script})" if own is None else f"| {scene['name']} | "
         assert said in page and scene["source"]
         for quantity in scene["quantities"]:
             assert f"| {scene['name']} | {quantity['what']} |" in page

@@ -404,20 +404,13 @@ def test_what_is_refused():
     refused(uem.InputTypeError, ("couplings[1]",), lambda: r.problem(r.part(0), 3.0))
 
 
-def test_steps_and_gradients_that_have_none():
-    """Explicit steps and gradients name couplings."""
+def test_explicit_steps_have_none():
+    """Explicit steps name couplings."""
     r = Row()
     parts = r.held(), r.part(1)
     ball, mass = uem.Ball(*parts, r.at(2.25)), uem.lumped_mass(r.V, 1.0)
     explicit = uem.Dynamics(mass, scheme=uem.CentralDifferences())
     refused(uem.InputError, "couplings does not go with CentralDifferences", lambda: r.problem(*parts, ball, dynamics=explicit))
-    parts = r.held(), r.part(1)
-    f = fem.Constant(r.scene.mesh, 1.0)
-    problem = uem.UnitedProblem(
-        f * st_venant(r.u, 1.0), r.u, couplings=[*parts, uem.Slider(*parts, r.at(2.25), (1.0, 0.0), stiffness=1.0)]
-    )
-    problem.solve()
-    refused(uem.InputError, "joints", lambda: uem.gradient(problem, r.u[0] * uem.ds(r.tags[1]), [f]))
 
 
 def test_joints_that_contradict_conditions():

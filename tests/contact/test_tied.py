@@ -316,12 +316,3 @@ def test_named_errors():
     apart = uem.Contact(b.high, b.low, tied="after")
     uem.UnitedProblem(F, b.u, bcs=clamp(b.V, b.bottom), contacts=[apart])
     raised(uem.SurfaceError, "touches the target to be tied", apart.tie)
-
-
-def test_no_gradient():
-    b = blocks(COMM, "triangle", 2, 2)
-    E = modulus(b.scene, 1.0, 1.0)
-    tie = uem.Contact(b.high, b.low, tied=True)
-    problem = uem.UnitedProblem(linear(b.u, E), b.u, bcs=b.oedometer(0.01), contacts=[tie])
-    problem.solve()
-    raised(uem.InputError, "do not support ties", lambda: uem.gradient(problem, b.u[0] * ufl.dx, [E]))

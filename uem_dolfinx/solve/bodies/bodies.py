@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,6 @@ from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.solve.bodies.linear_forces import explicit_forces
 from uem_dolfinx.solve.bodies.norms import first
 from uem_dolfinx.solve.bodies.tangent import Inversions, Tangent
 
@@ -100,8 +99,13 @@ class Bodies:
         self._assembled_at: Array | None = None
         self.hold(bcs)
         self.dead: Array | None = None
+        #: Writes F at the present displacement to a vector.
+        self._assemble: Callable[[PETSc.Vec], None] = partial(forms.assemble_vector, L=self._F)
         if dynamics is not None:
+            from uem_dolfinx.solve.bodies.linear_forces import explicit_forces
+
             dynamics.hold(~self.free[: config.n_owned])
+            self._assemble = explicit_forces(self, J) or self._assemble
         self.wanted: Array = np.array(self.u.x.array)
         self.stiffness: Array | None = None
         #: Its value at the end of the last step, which the next step starts with.
@@ -110,8 +114,6 @@ class Bodies:
         self._stiffness_of = -1
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self._inversions = Inversions(config) if check and config.moves else None
-        #: Writes F at the present displacement to a vector.
-        self._assemble = explicit_forces(self, J) or partial(forms.assemble_vector, L=self._F)
         self._fields: Any = None
         if self.unknowns.mixed:
             from uem_dolfinx.solve.bodies.field_scales import FieldScales
@@ -179,8 +181,7 @@ class Bodies:
         """A norm of forces, or one for each field ``(n_fields,)``, combined with other norms of the displacement's forces."""
         if not more:
             return norm
-        size = float(np.linalg.norm(more))
-        return np.hypot(norm, size if self._fields is None else self.of_fields(size))
+        return np.hypot(norm, self.of_fields(float(np.linalg.norm(more))))
 
     @property
     def linear(self) -> bool:
@@ -293,9 +294,8 @@ class Bodies:
         for bc in self.bcs:
             own[compat.bc_dofs(bc)[0]] = True
         self.held: Bools = self.of_owners(own)
-        lost = np.flatnonzero(own & ~self.held)
         with agreed(self.comm):
-            if len(lost):
+            if len(lost := np.flatnonzero(own & ~self.held)):
                 raise InputError(
                     f"a Dirichlet condition holds {self.config.place_of(int(lost[0]))} on rank {self.comm.rank}, but not on the rank that "
                     "owns the node: expected conditions at the same nodes on all ranks; locate them by uem.dirichlet, or by "
