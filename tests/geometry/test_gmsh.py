@@ -6,6 +6,7 @@ Worth reading first: ``test_tags_are_where_they_were_drawn`` (each rank's entiti
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 from mpi4py import MPI
@@ -15,6 +16,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
+from helpers import environment, serial
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -345,3 +347,25 @@ def test_examples_come_with_the_package():
     assert uem.example_mesh("hertz_cylinder").read_text(encoding="utf-8").count("Physical") > 3
     with pytest.raises(uem.InputError, match="'hertz_cylinder'.*did you mean 'hertz_sphere'"):
         uem.example_mesh("hertz_spher")
+
+
+@serial
+def test_gmsh_is_not_called_before_it_is_initialised():
+    """Gmsh 4.8 would read there whether errors end the process, from memory that is not set: one in some hundred scripts ended silently."""
+    script = """
+import gmsh
+from uem_dolfinx import compat
+
+def called(*a):
+    raise SystemExit("called")
+
+kept, gmsh.model.list = gmsh.model.list, called
+assert not compat.gmsh_is_initialized(gmsh)
+gmsh.model.list = kept
+gmsh.initialize(["gmsh"], False)
+assert compat.gmsh_is_initialized(gmsh)
+gmsh.finalize()
+assert not compat.gmsh_is_initialized(gmsh)
+"""
+    done = subprocess.run([sys.executable, "-c", script], env=environment(), capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
