@@ -237,7 +237,8 @@ FEATURES = {
     "coupling, led, friction": (led, {"friction": 0.3}, (*FREE, *MOTION)),
     "equation": (equation, {}, (*ALL, "b of the equation", "offset", "X")),
     "mean motion": (mean, {}, (*ALL, "mean motion", "offset")),
-    "coupling, slider": (coupling, {"joints": sliding}, (*FREE, *LOADS)),
+    # a slider takes all of a moment
+    "coupling, slider": (coupling, {"joints": sliding}, (*FREE, LOADS[0])),
     "force and spring at nodes": (points, {}, (*ALL, "force at a node", "offset", "X")),
 }  # fmt: skip
 NEEDS_HISTORY = ("tie, friction beside it", "preload, locked", "coupling, led, friction")
