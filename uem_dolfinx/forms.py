@@ -406,6 +406,12 @@ def values_of(m: fem.Constant | fem.Function) -> Any:
     return m.x.array if isinstance(m, fem.Function) else m.value
 
 
+def read_values(inputs: Sequence[fem.Constant | fem.Function], before: list[Any] | None) -> tuple[list[Any], bool]:
+    """Copies of the values of Constants and Functions, and whether they are those of ``before`` on this rank."""
+    values = [np.array(values_of(one)) for one in inputs]
+    return values, before is not None and all(np.array_equal(*pair) for pair in zip(values, before))
+
+
 def in_all_cells(F: ufl.Form, u: fem.Function, laws: bool = False) -> ufl.Form:
     """A residual with a zero term in all cells, so that the sparsity of the tangent includes every diagonal entry.
 

@@ -86,16 +86,21 @@ def to_owners(space: Nodes, A: Blocks) -> Blocks:
     return Blocks(*Exchange.to(space.comm, space.owner_of(A.row)).send(*A))
 
 
+def places_of(A: Blocks, rows: Ints) -> tuple[Ints, Ints]:
+    """Places of the blocks in ``rows (m,)``, possibly repeated, row after row, and their number in each ``(m,)``."""
+    order = np.argsort(A.row, kind="stable")
+    low, high = (np.searchsorted(A.row[order], rows, side=side) for side in ("left", "right"))
+    counts = high - low
+    return order[np.repeat(low - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())], counts
+
+
 def rows_at(space: Nodes, A: Blocks, nodes: Ints) -> Blocks:
     """Rows of A, stored on their owners, at distinct global ``nodes (m,)`` of any rank (collective)."""
     asking = Exchange.to(space.comm, space.owner_of(nodes))
     (asked,) = asking.send(nodes)
-    order = np.argsort(A.row, kind="stable")
-    low, high = (np.searchsorted(A.row[order], asked, side=side) for side in ("left", "right"))
-    counts = high - low
-    places = np.repeat(low - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+    places, counts = places_of(A, asked)
     ranks = np.repeat(asking.origins, counts)
-    lists = np.split(order[places], np.searchsorted(ranks, np.arange(1, space.comm.size)))
+    lists = np.split(places, np.searchsorted(ranks, np.arange(1, space.comm.size)))
     return Blocks(*Exchange(space.comm, lists).send(*A))
 
 

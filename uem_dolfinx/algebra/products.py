@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, product, summed, to_owners, together
+from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, places_of, product, summed, to_owners, together
 from uem_dolfinx.algebra.entries import Entries, blocks_of
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
@@ -162,10 +162,7 @@ class UnitedMatrix:
         if comm.size == 1:
             return trial
         rank, row = np.unique(np.column_stack([self.space.owner_of(coupled.column), coupled.row]), axis=0).T
-        order = np.argsort(trial.row, kind="stable")
-        low, high = (np.searchsorted(trial.row[order], row, side=side) for side in ("left", "right"))
-        counts = high - low
-        places = order[np.repeat(low - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())]
+        places, counts = places_of(trial, row)
         lists = np.split(places, np.searchsorted(np.repeat(rank, counts), np.arange(1, comm.size)))
         lists[comm.rank] = np.arange(len(trial.row))
         return Blocks(*Exchange(comm, lists).send(*trial))

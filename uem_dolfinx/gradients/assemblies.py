@@ -92,7 +92,7 @@ def by_section(section: Preloaded, parameter: str, n: int) -> tuple[Array, Array
     return gaps, pushed
 
 
-class Told(NamedTuple):
+class Prescribed(NamedTuple):
     """What equations, couplings and preloads of a problem prescribe in a step.
 
     Attributes:
@@ -106,7 +106,7 @@ class Told(NamedTuple):
     sections: list[tuple[float, bool, bool, float]]
 
     @classmethod
-    def of(cls, problem: UnitedProblem) -> Told:
+    def of(cls, problem: UnitedProblem) -> Prescribed:
         """The present ones."""
         return cls(
             [] if problem.linear is None else [one.led for one in problem.linear.parts],

@@ -25,7 +25,7 @@ from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
-from uem_dolfinx.gradients.assemblies import Told, constants_of
+from uem_dolfinx.gradients.assemblies import Prescribed, constants_of
 from uem_dolfinx.gradients.gradient import (
     AnyControl,
     check_controls,
@@ -147,7 +147,7 @@ class History(given.Sealed):
             shares=shares,
             held=held,
             dt=0.0 if dynamics is None else dynamics.dt,
-            told=Told.of(problem),
+            told=Prescribed.of(problem),
         )
 
     def gradient(
@@ -184,7 +184,7 @@ class History(given.Sealed):
         self._refuse_moved_nodes()
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
         values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
-        offsets, told = [pair.discretisation.offset for pair in problem.pairs], Told.of(problem)
+        offsets, told = [pair.discretisation.offset for pair in problem.pairs], Prescribed.of(problem)
         sweep = Sweep(problem, some)
         try:
             begun = False

@@ -14,7 +14,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.rigid import Motion
-from uem_dolfinx.gradients.assemblies import Told
+from uem_dolfinx.gradients.assemblies import Prescribed
 from uem_dolfinx.solve.memory import Memory
 
 
@@ -45,7 +45,7 @@ class Record:
     shares: dict[int, float]
     held: Array | float
     dt: float
-    told: Told
+    told: Prescribed
 
 
 class Records:

@@ -11,6 +11,7 @@ from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.products import made_of
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.dynamics.explicit.surface import factorised
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
@@ -65,10 +66,11 @@ class MassSolver(UnitedSolver):
             forces = together(forces, product(more, rows_at(space, trial, np.unique(more.column))))
         A = product(test.transposed, forces)
         self._at: Ints = (g * nodes[:, None] + np.arange(g)).ravel()
-        self._pc = None
-        if not space.comm.allreduce(len(nodes)):
+        self._pc: PETSc.PC | None = None
+        size = space.comm.allreduce(len(nodes))
+        if not size:
             return
-        first, size = int(space.comm.scan(len(nodes))) - len(nodes), space.comm.allreduce(len(nodes))
+        first = int(space.comm.scan(len(nodes))) - len(nodes)
         numbers = np.zeros((space.n_owned, 1), dtype=np.int64)
         numbers[nodes, 0] = first + np.arange(len(nodes))
         A = to_owners(space, A)
@@ -81,15 +83,8 @@ class MassSolver(UnitedSolver):
         matrix = PETSc.Mat().createAIJ(
             ((g * len(nodes), None), (g * len(nodes), None)), csr=_lines(i, j, value, len(nodes), size), comm=space.comm
         )
-        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, P is Q and G is None)
         self._rhs, self._dq = matrix.createVecs()
-        self._pc = PETSc.PC().create(space.comm)
-        self._pc.setType("cholesky" if P is Q and G is None else "lu")
-        if space.comm.size > 1:
-            self._pc.setFactorSolverType("mumps")
-        self._pc.setOperators(matrix)
-        with timed("factorisation or preconditioner set-up"):
-            self._pc.setUp()
+        self._pc = factorised(matrix, P is Q and G is None)
 
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and 1 for the number of linear iterations (collective).

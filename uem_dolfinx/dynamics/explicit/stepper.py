@@ -147,8 +147,7 @@ class ExplicitStepper:
             StepAccuracyError: with both lengths.
         """
         problem = self.problem
-        changed = not problem.bodies.linear and np.isfinite(self._shortest)
-        if changed:
+        if changed := not problem.bodies.linear:
             largest = reduced(problem.comm, float(np.abs(a).max(initial=0.0)), op=MPI.MAX)
             changed = 2.0 * largest * dt**2 > CHECKED_STRAIN * self._shortest
         if not changed and self.pattern() == before:

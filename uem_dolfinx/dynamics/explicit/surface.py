@@ -77,13 +77,18 @@ class SurfaceSolver:
         self._at: Ints = np.flatnonzero(P.used)
         own = PETSc.IS().createGeneral((self._at + space.block * space.first).astype(PETSc.IntType), comm=space.comm)
         self._A = A.createSubMatrix(own, own)
-        self._A.setOption(PETSc.Mat.Option.SYMMETRIC, P is self._Q)
         self._rhs, self._dq = self._A.createVecs()
-        self._pc = PETSc.PC().create(space.comm)
-        self._pc.setType("cholesky" if P is self._Q else "lu")
-        if space.comm.size > 1:
-            self._pc.setFactorSolverType("mumps")
-        self._pc.setOperators(self._A)
-        with timed("factorisation or preconditioner set-up"):
-            self._pc.setUp()
-        self.kept = True
+        self._pc, self.kept = factorised(self._A, P is self._Q), True
+
+
+def factorised(A: PETSc.Mat, symmetric: bool) -> PETSc.PC:
+    """A matrix, factorised (collective)."""
+    A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+    pc = PETSc.PC().create(A.comm)
+    pc.setType("cholesky" if symmetric else "lu")
+    if A.comm.size > 1:
+        pc.setFactorSolverType("mumps")
+    pc.setOperators(A)
+    with timed("factorisation or preconditioner set-up"):
+        pc.setUp()
+    return pc

@@ -105,7 +105,7 @@ class Bodies:
             from uem_dolfinx.solve.bodies.linear_forces import explicit_forces
 
             dynamics.hold(~self.free[: config.n_owned])
-            self._assemble = explicit_forces(self, J) or self._assemble
+            self._assemble = explicit_forces(self, self._F, J) or self._assemble
         self.wanted: Array = np.array(self.u.x.array)
         self.stiffness: Array | None = None
         #: Its value at the end of the last step, which the next step starts with.

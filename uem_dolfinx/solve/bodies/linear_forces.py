@@ -23,17 +23,18 @@ from uem_dolfinx.parallel import reduced
 TRANSLATION_ROUNDING = 4.0 * np.finfo(float).eps
 
 
-def explicit_forces(bodies: Any, J: ufl.Form | None) -> Callable[[PETSc.Vec], None] | None:
+def explicit_forces(bodies: Any, form: Any, J: ufl.Form | None) -> Callable[[PETSc.Vec], None] | None:
     """How linear bodies write their residual F(u) to a vector in explicit steps, where K has no inertia; None for others.
 
     Args:
         bodies: with F, tangent, materials, points and dynamics.
+        form: F, compiled.
         J: tangent of users, or None.
     """
     dynamics = bodies.dynamics
     if dynamics is None or not isinstance(dynamics.scheme, CentralDifferences) or dynamics.damping is not None:
         return None
-    return LinearForces(bodies).assemble if bodies.linear and bodies.points is None and J is None else None
+    return LinearForces(bodies, form).assemble if bodies.linear and bodies.points is None and J is None else None
 
 
 class LinearForces:
@@ -41,11 +42,12 @@ class LinearForces:
 
     Args:
         bodies: whose K is constant, and has no inertia.
+        form: F, compiled.
     """
 
-    def __init__(self, bodies: Any):
-        self._bodies, self._inputs = bodies, [one for one in forms.with_derivatives(bodies.F)[1] if one is not bodies.u]
-        self._form = forms.form(bodies.F)
+    def __init__(self, bodies: Any, form: Any):
+        self._bodies, self._form = bodies, form
+        self._inputs = [one for one in forms.with_derivatives(bodies.F)[1] if one is not bodies.u]
         #: Values of Constants and Functions at the last call, and F(0) with them; None until it is needed.
         self._values: list[Array] | None = None
         self._at_zero: Array | None = None
@@ -55,8 +57,7 @@ class LinearForces:
 
     def assemble(self, b: PETSc.Vec) -> None:
         """Write F(u) to the owned entries of ``b``; loads that have changed since the last call take an assembly (collective)."""
-        bodies, values = self._bodies, [np.array(forms.values_of(one)) for one in self._inputs]
-        same = self._values is not None and all(np.array_equal(*pair) for pair in zip(values, self._values))
+        bodies, (values, same) = self._bodies, forms.read_values(self._inputs, self._values)
         bodies.tangent.update()
         if not reduced(bodies.comm, same, op=MPI.LAND) or bodies.tangent.completed:
             self._values, self._at_zero = values, None

@@ -99,9 +99,8 @@ class Tangent:
 
     def update(self) -> None:
         """Assemble K if something that it depends on has changed (collective)."""
-        values = [np.array(forms.values_of(c)) for c in self._inputs]
+        values, same = forms.read_values(self._inputs, self._values)
         factor = self._dynamics.factor if self._dynamics is not None else 0.0
-        same = self._values is not None and all(np.array_equal(a, b) for a, b in zip(values, self._values))
         same &= factor == self._factor
         comm = self.K.comm.tompi4py()
         if reduced(comm, int(same)) == comm.size:
