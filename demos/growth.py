@@ -107,5 +107,7 @@ with uem.figure(args.plot, comm, panels=2) as panels:
             if model:
                 ranks = np.geomspace(2, 8000, 60)
                 panel.plot(ranks, [sum(growth.on_paper(model, each * p, p).values()) for p in ranks], "-", lw=1, color=f"C{k}")
-        panel.set(xscale="log", yscale="log", xlabel="ranks", ylabel=label)
-        panel.legend(frameon=False)
+        panel.set(xlabel="ranks", ylabel=label)
+        if any(len(line.get_xdata()) for line in panel.lines):  # one rank tells no other anything
+            panel.set(xscale="log", yscale="log")
+            panel.legend(frameon=False)
