@@ -4,7 +4,7 @@ python3 demos/growth.py --json growth.json --plot growth.png
 
 Options:
     where: apart: a call of mpiexec for each number of ranks; here: the ranks of this call
-    scenes: pair: a declared contact; friction: one with friction; general: a general contact; comma-separated
+    scenes: pair: a declared contact; friction: one with friction; general: a general contact; overhang: one at two edges of a block
     sizes: cells along a side of the blocks, comma-separated
     ranks: numbers of ranks, comma-separated; there may be more than cores, since nothing is timed
     memory: 1: the memory of Python and NumPy is counted, too
@@ -26,6 +26,7 @@ Options:
 # | row_bytes | rows of points, feet, equations and matrices, from the ranks that have them |
 # | sent_bytes | in messages to single ranks: halos of vectors and matrices |
 # | messages | to single ranks, those with rows too |
+# | row_blocks, most_row_blocks | blocks of a row of P at an eliminated node, mean and largest |
 # | python_bytes | memory of Python and NumPy, the largest from the making of the problem on |
 #
 # The model has a term for each part of the scene that a rank may have to do with; what goes with the number of ranks, or with the whole
@@ -41,7 +42,7 @@ from benchmarks.apart import run_on
 import uem_dolfinx as uem
 
 args = common.arguments(
-    __doc__, where=("apart", "here"), scenes="pair,general", sizes="6,9,12", ranks="2,4,8,16", memory=1, unknowns=100.0
+    __doc__, where=("apart", "here"), scenes="pair,general,overhang", sizes="6,9,12", ranks="2,4,8,16", memory=1, unknowns=100.0
 )
 scenes = args.scenes.split(",")
 

@@ -55,10 +55,13 @@ def blocks(n: int, declared: str) -> Callable[[], uem.UnitedProblem]:
 
     Args:
         n: cells along a side.
-        declared: ``"pair"``, a declared contact; ``"friction"``, one with friction; ``"general"``, a general contact.
+        declared: ``"pair"``, a declared contact; ``"friction"``, one with friction; ``"general"``, a general contact;
+            ``"overhang"``, a general contact of a block that hangs over two edges of the other one.
     """
-    below, above = box("hexahedron", (0, 0, -0.5), (1, 1, 0), (n, n, n // 2)), (0.11, 0.09, 0)
-    s = scene(comm, "hexahedron", [below, box("hexahedron", above, (0.91, 0.89, 0.5), (n, n, n // 2))])
+    below, lo = box("hexahedron", (0, 0, -0.5), (1, 1, 0), (n, n, n // 2)), np.array([0.11, 0.09, 0])
+    if declared == "overhang":
+        lo += [0.3, 0.3, 0]
+    s = scene(comm, "hexahedron", [below, box("hexahedron", lo, lo + [0.8, 0.8, 0.5], (n, n, n // 2))])
     V = uem.function_space(s.mesh, 1, (3,))
     tags = {"bottom": s.tag("bottom", 0, at(2, -0.5), 1), "top": s.tag("top", 1, at(2, 0.5), 2)}
     surfaces = s.tag("upper", 1, at(2, 0.0), 3), s.tag("lower", 0, at(2, 0.0), 4)
@@ -71,7 +74,7 @@ def blocks(n: int, declared: str) -> Callable[[], uem.UnitedProblem]:
 
         bcs = [uem.dirichlet(V, tags["bottom"]), uem.dirichlet(V, tags["top"], value=top)]
         contact: Any = uem.Contact(*surfaces, friction=0.3 if declared == "friction" else 0.0)
-        if declared == "general":
+        if declared in ("general", "overhang"):
             contact = uem.GeneralContact()
         F = uem.LinearElastic(1.0, 0.3).residual(u, ufl.TestFunction(V)) * ufl.dx
         how = {"contacts": [contact], "load": move, "petsc_options": cg(), "petsc_options_prefix": "growth_"}
@@ -109,8 +112,18 @@ def step(n: int, declared: str, memory: bool = False) -> dict[str, Any]:
             total = reduced(comm, sum((stages[name] for name in within), np.zeros(len(KINDS), np.int64)), op=MPI.MAX)
             row |= {prefix + kind: float(count) / linearisations for kind, count in zip(KINDS, total)}
         row["stages"] = {name: dict(zip(KINDS, map(float, most[name]))) for name in names}
+        row |= blocks_of_rows(problem)
     steps.close()
     return row | {"iterations": done.newton_iterations, "exchanges": done.exchanges}
+
+
+def blocks_of_rows(problem: uem.UnitedProblem) -> dict[str, float]:
+    """Blocks of rows of P at eliminated nodes, their mean and largest number; also how many equations there are (collective)."""
+    restriction = problem.system.restriction()
+    _, counts = np.unique(restriction.rows().row, return_counts=True)
+    total, many = reduced(comm, np.array([counts.sum(), len(counts)]))
+    most = reduced(comm, int(counts.max(initial=0)), op=MPI.MAX)
+    return {"equations": restriction.n_equations, "row_blocks": float(total / max(many, 1)), "most_row_blocks": int(most)}
 
 
 def fitted(rows: list[dict[str, Any]], count: str) -> dict[str, float]:

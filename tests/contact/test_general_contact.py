@@ -65,6 +65,32 @@ def test_as_declared_by_hand(cell, n_low, n_high, degree, mu):
         assert np.abs(one.force - other.force).max() < 1e-12 and np.abs(one.moment - other.moment).max() < 1e-12
 
 
+@pytest.mark.parametrize("cell,n", [("quadrilateral", 8), ("triangle", 8), ("tetrahedron", 4), ("hexahedron", 4)])
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_a_small_block_on_a_large_one(cell, n, mu):
+    """Equally fine, in either order of the input: no equation follows another, rows of P have one block and those of a facet's nodes,
+    and forces and displacements are alike."""
+    g, found = dimension(cell), []
+    parts = [box(cell, [0.0] * g, [1.0] * (g - 1) + [0.5], [n] * (g - 1) + [n // 2])]
+    parts.append(box(cell, [0.11, 0.09][: g - 1] + [0.5], [0.91, 0.89][: g - 1] + [1.0], [n] * (g - 1) + [n // 2]))
+    on_facet = {"quadrilateral": 2, "triangle": 2, "tetrahedron": 3, "hexahedron": 4}[cell]
+    for low in (0, 1):
+        b = Bodies(cell, parts if low == 0 else parts[::-1])
+        bottom, top = b.side(low, g - 1, 0.0), b.side(1 - low, g - 1, 1.0)
+        bcs = [*clamp(b.V, bottom), *clamp(b.V, top, value=[0.005, *[0.0] * (g - 2), -0.03])]
+        problem = b.problem([uem.GeneralContact(friction=mu)], bcs)
+        problem.solve()
+        r = problem.system.restriction()
+        rows = r.rows()
+        assert r.chain == 1 and r.rings is None and r.n_equations > n ** (g - 1)
+        blocks_of_row = np.unique(rows.row, return_counts=True)[1]
+        assert highest(COMM, blocks_of_row) <= on_facet + 1
+        drawn, u = b.s.drawing, b.s.gather(b.u)
+        found.append((u[np.lexsort(np.round(drawn, 9).T)], problem.reaction(top)))
+    (u, force), (v, other) = found
+    assert np.abs(u - v).max() < 1e-10 and np.abs(force - other).max() < 1e-10 * np.abs(force).max()
+
+
 @pytest.mark.parametrize("rows,columns,end", [(2, 1, 0.12), slow(3, 2, 0.6)])
 def test_discs_in_motion(rows, columns, end):
     """Every step, iteration and displacement is that of pairs declared by hand."""

@@ -145,6 +145,19 @@ def test_the_finer_follows(length):
         assert np.array_equal(skin.order([]), place), n
 
 
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_the_smaller_of_equally_fine_bodies_follows(cell, turn):
+    """Whatever the pose and the order of the input; of equally large bodies the first in the mesh's input."""
+    g = dimension(cell)
+    for sides, place in (((1.0, 0.8), (1, 0)), ((0.8, 1.0), (0, 1)), ((1.0, 0.8, 0.6), (2, 1, 0)), ((1.0, 0.99), (0, 1))):
+        boxes = [
+            box(cell, [2.0 * k] + [0.0] * (g - 1), [2.0 * k + a] + [a] * (g - 1), [round(5 * a)] * g) for k, a in enumerate(sides)
+        ]
+        _, skin = skin_of(cell, [turned(b, turn * k) for k, b in enumerate(boxes)])
+        assert np.array_equal(skin.order([]), place), sides
+
+
 def test_a_given_order():
     """Bodies that are named come first, by facets or by cells; the others as before."""
     s, skin = skin_of("triangle", three("triangle", 2, 4, 8))

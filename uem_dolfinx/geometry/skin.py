@@ -24,9 +24,12 @@ from uem_dolfinx.parallel import Exchange, reduced
 if TYPE_CHECKING:
     from uem_dolfinx.geometry.edge_crossings import Crossings
 
-#: Bodies whose facets differ less in size are equally fine; the order of the mesh's input then determines which body follows.
+#: Bodies whose facets differ less in size are equally fine; of these the smaller body follows.
 #: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
 ALIKE_IN_SIZE = 1.5
+#: Bodies whose surfaces differ less are equally large; the order of the mesh's input then determines which body follows.
+#: [convention; ratio of areas; test_skin.py::test_the_smaller_of_equally_fine_bodies_follows]
+ALIKE_IN_AREA = 1.1
 
 
 #: Two sets of facets that never touch each other, as local nodes and this rank's facets of both.
@@ -46,6 +49,7 @@ class Skin(TargetFacets):
         body: body of each facet ``(m,)``.
         edges: neighbours and sharpness at each side of each facet.
         size: mean length of the sides of each body's facets, 0 for a body without facets ``(n_bodies,)``.
+        area: sum over each body's facets of their mean side, in 3D its square ``(n_bodies,)``.
         extent: diagonal of each body's bounding box in the reference configuration ``(n_bodies,)``.
     """
 
@@ -66,10 +70,10 @@ class Skin(TargetFacets):
         self.body: Ints = self.body_of_node[self.dofs[:, 0]]
         #: Half of the longest side of each facet ``(m,)``.
         self.radius: Array = 0.5 * self._sides().max(axis=1, initial=0.0)
-        sums = np.zeros((self.n_bodies, 2))
-        np.add.at(sums, self.body, np.column_stack([self._sides().mean(axis=1), np.ones(len(self.body))]))
-        total = reduced(config.comm, sums)
-        self.size: Array = total[:, 0] / np.maximum(total[:, 1], 1.0)
+        sums, side = np.zeros((self.n_bodies, 3)), self._sides().mean(axis=1)
+        np.add.at(sums, self.body, np.column_stack([side, side ** (config.gdim - 1), np.ones(len(self.body))]))
+        side_sum, self.area, count = reduced(config.comm, sums).T
+        self.size: Array = side_sum / np.maximum(count, 1.0)
         g, ends = config.gdim, np.full((self.n_bodies, 2 * config.gdim), -np.inf)
         np.maximum.at(ends, self.body_of_node, np.column_stack([config.X, -config.X]))
         ends = reduced(config.comm, ends, op=MPI.MAX)
@@ -82,8 +86,11 @@ class Skin(TargetFacets):
     def order(self, first: list[Tag], rigid: Bools | None = None) -> Ints:
         """Position of each body in the order; each body follows the later ones ``(n_bodies,)`` (collective).
 
+        Edges of a small body lie on faces of a large one rather than the other way round. If the small body follows, its edge nodes
+        do not follow in the opposite direction too, so that equations of its contactors form no rings.
+
         Args:
-            first: parts of bodies that come first, in this order; the other bodies follow, finer ones first.
+            first: parts of bodies that come first, in this order; the other bodies follow, finer ones first, then smaller ones.
             rigid: mask of nodes that move as rigid bodies ``(n_owned,)``, or None. Bodies with an entirely rigid surface come last:
                 the equations of more than three contactors in 2D, or six in 3D, would be linearly dependent.
         """
@@ -97,8 +104,9 @@ class Skin(TargetFacets):
             named[self.bodies_of(tag)] = k
         with np.errstate(divide="ignore"):
             fine = np.round(np.log(self.size / self.size.max()) / np.log(ALIKE_IN_SIZE))
+            small = np.round(np.log(self.area / self.area.max()) / np.log(ALIKE_IN_AREA))
         place = np.empty(self.n_bodies, np.int64)
-        place[np.lexsort((np.arange(self.n_bodies), fine, named))] = np.arange(self.n_bodies)
+        place[np.lexsort((np.arange(self.n_bodies), small, fine, named))] = np.arange(self.n_bodies)
         return place
 
     def bodies_of(self, tag: Tag) -> Bools:

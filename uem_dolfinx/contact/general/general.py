@@ -52,7 +52,7 @@ class GeneralContact(OfProblem, given.Sealed):
         exclude: parts without contact, and pairs of parts ``(one, other)`` without contact between them, of facets or of cells.
             Surfaces paired by another ``Contact`` of the problem are left to it; its tied nodes have no contact next to the tie.
         order: parts, of facets or of cells, whose bodies' nodes follow all later ones; other bodies come after these, the finer
-            first, with mortar those that couplings make rigid last.
+            first, of equally fine ones the smaller, with mortar those that couplings make rigid last.
         self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
             order of the mesh's input.
