@@ -76,7 +76,7 @@ def pressed(
         u.x.array[:] = 0.0
         if rigid:
             target.move(values["place"], values["turn"])
-        contact = uem.Contact(b.high, target, coupling=coupling, measure=measure, offset=float(values["offset"]))
+        contact = uem.Contact(b.high, target, coupling=coupling, measure=measure, offset=values["offset"])
         problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], rtol=1e-13, **options)
         run(problem)
         return problem
@@ -160,6 +160,8 @@ DRAGGED = [
 def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM):
     """A block that is pressed onto another, or onto a rigid surface, and dragged over it in some steps: some contactors stick, others slip.
 
+    ``mu``: the coefficient of friction, or a function of a scalar space that returns a Function.
+
     ``solve()`` takes the steps anew with the present values of all that the solution depends on; ``values`` are those of the contact.
     """
     b = blocks(comm, cell, *((3, 4) if cell == "triangle" else (2, 3)), overhang=0.25)
@@ -170,6 +172,8 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM):
     material = uem.NeoHooke(E, 0.3, kind=kind) if law == "neo" else uem.LinearElastic(E, 0.3, kind=kind)
     F = material.residual(u, v) * ufl.dx - ufl.inner(full, v) * ufl.dx
     push = fem.dirichletbc(top, fem.locate_dofs_topological(b.V, g - 1, b.top.entities), b.V)
+    if callable(mu):
+        mu = mu(compat.function_space(mesh, ("Lagrange", 1)))
     values = {"full": np.full(g, 0.002), "friction": mu, "place": np.zeros(g), "turn": np.zeros(() if g == 2 else 3)}
 
     def solve():
@@ -179,7 +183,7 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM):
             middle, up = [0.5] * (g - 1), np.eye(g)[-1] + 0.05 * np.eye(g)[0]
             target = uem.RigidPlane([*middle, 0.0], up) if rigid == "plane" else uem.RigidSphere([*middle, -3.0], 3.0)
             target.move(values["place"], values["turn"])
-        contact = uem.Contact(b.high, target, friction=float(values["friction"]))
+        contact = uem.Contact(b.high, target, friction=values["friction"])
         bcs, load = [*clamp(b.V, b.bottom), push], {full: values["full"]}
         problem, states = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load=load, rtol=1e-13), []
         with uem.recording(problem) as history:

@@ -17,11 +17,11 @@ from uem_dolfinx.contact.laws.law import (
     Field,
     FrictionLaw,
     as_law,
-    follows_load,
     given_field,
     given_friction,
     given_joint,
     given_normal,
+    is_read_again,
     of_rate,
     parameters,
     values_at,
@@ -77,8 +77,9 @@ class Contact(WatchedContact, given.Sealed):
         thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper than
             this lies behind the body, not in it. None: the body is treated as infinitely thick.
         friction: Coulomb's coefficient: a number, a function of points ``(3, n)`` of the reference configuration that returns
-            ``(n,)``, a function of these and of the load factor or time at the end of the step, or an ``OfTemperature``. Or a law
-            of friction with any of these as parameter: ``Coulomb`` with a limit, ``Tresca``, ``Stribeck``. With 0 the contact is
+            ``(n,)``, a function of these and of the load factor or time at the end of the step, a scalar Function of the
+            displacement's nodes, whose values every step reads, or an ``OfTemperature``. Or a law of
+            friction with any of these as parameter: ``Coulomb`` with a limit, ``Tresca``, ``Stribeck``. With 0 the contact is
             frictionless. If the contact was made with friction, it may be changed between steps, by the same law. Other settings,
             except ``offset``, cannot be changed once a problem has been made.
         wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of position as for ``friction``.
@@ -92,9 +93,9 @@ class Contact(WatchedContact, given.Sealed):
         tied: True ties contactors within reach to the target permanently, in all components: they never open and never slip, and
             gaps are kept and rotate with the target. Contactors out of reach remain in contact. ``"after"`` is contact until
             :meth:`tie` is called.
-        offset: additional thickness of both surfaces together, a length or a function of position as for ``friction``: gaps are
-            smaller by it. If surfaces coincide, a positive offset is an interference, a negative one a clearance. It may be changed
-            between steps, or by a function of the load factor, ``load`` of the problem.
+        offset: additional thickness of both surfaces together, a length, or a function of position or a Function as for ``friction``:
+            gaps are smaller by it. If surfaces coincide, a positive offset is an interference, a negative one a clearance. It may be
+            changed between steps, or by a function of the load factor, ``load`` of the problem.
         adjust: a length, or True for a side of a target's facet (on a rigid surface ``max_penetration``): contactors with an
             initial gap or penetration of at most this length are initially in contact, free of stress. No node is moved: the
             initial gap of each contactor becomes part of its offset; :attr:`adjusted` is the largest. Tied contactors keep their
@@ -237,15 +238,18 @@ class Contact(WatchedContact, given.Sealed):
             self.at_corners._take_friction(law, self._friction_at(law, self.at_corners.nodes, self._at))
 
     def take_load(self, at: float, known: bool = False) -> None:
-        """Update friction to a load factor or a time, if it depends on these (collective).
+        """Update friction to a load factor or a time, if it depends on these, and values of Functions (collective).
 
         Args:
             at: load factor, in dynamics the time.
             known: whether the committed state belongs to it; otherwise it applies from the next step on.
         """
         self._at = at
+        if isinstance(self._offset, fem.Function) and self._offsets_of_pair().read_again(self._offset):
+            self._set_offset()
+            self.pair.project()
         law = as_law(self._friction)
-        if not follows_load(law):
+        if not is_read_again(law):
             return
         value, friction = self._friction_at(law, self.pair.nodes, at), self.pair.friction
         assert value is not None and friction is not None

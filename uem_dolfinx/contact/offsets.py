@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from mpi4py import MPI
 
 import numpy as np
+from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
@@ -42,6 +43,12 @@ class Offsets:
         config, nodes, words = self.pair.config, self.pair.nodes, f"contact '{self._name}': offset"
         self.declared = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
         self._hand_over()
+
+    def read_again(self, offset: fem.Function) -> bool:
+        """Whether its values have changed since they were set (collective)."""
+        pair = self.pair
+        now = asked_at(pair.config, pair.nodes, f"contact '{self._name}': offset", offset, given.FINITE)
+        return reduced(pair.config.comm, not np.array_equal(now, self.declared), op=MPI.LOR)
 
     def wear(self, worn: Array) -> None:
         """Set wear depths ``(n,)``; contactors must be placed again (collective)."""

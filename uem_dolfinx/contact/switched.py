@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools
@@ -158,6 +159,7 @@ def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[
     Raises:
         InputError: if it depends on temperature now, and ``to`` does not.
     """
+    refuse_ramp(f"friction of contact '{contact.name}'", as_law(contact.friction).field, as_law(to).field)
     if follows_load(as_law(to)):
         return to
     if isinstance(as_law(contact.friction).field, OfTemperature):
@@ -169,6 +171,19 @@ def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[
         return value_at(between(before, after, share(s)), x)
 
     return _with_field(to, at)
+
+
+def refuse_ramp(what: str, *fields: Field) -> None:
+    """Refuse Functions at the ends of a ramp, which every step reads anew.
+
+    Raises:
+        InputError: names it.
+    """
+    if any(isinstance(f, fem.Function) for f in fields):
+        raise InputError(
+            f"{what} is a Function, which a Step does not ramp: expected numbers or functions of position; or change its values between "
+            "steps"
+        )
 
 
 def between(a: Field, b: Field, share: float) -> Field:

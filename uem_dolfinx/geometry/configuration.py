@@ -12,7 +12,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.arrays import AnyArray, Array
+from uem_dolfinx.arrays import AnyArray, Array, Indices
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
 from uem_dolfinx.geometry.bodies import rigid_velocities
@@ -76,6 +76,15 @@ class Configuration(Nodes):
     def numbers_as(self, V: Any) -> bool:
         """Whether another space has the same mesh and numbering as the displacement's, on this rank."""
         return compat.is_on(V, self.mesh) and np.array_equal(compat.cell_dofs(V), compat.cell_dofs(self.V))
+
+    def entries_in(self, W: Any) -> Indices | None:
+        """Local degrees of freedom of a scalar space at the nodes ``(n_local,)``; None if its nodes are not those of the displacement."""
+        own, theirs = compat.cell_dofs(self.V), compat.cell_dofs(W)
+        if not compat.is_on(W, self.mesh) or W.dofmap.index_map_bs != 1 or own.shape != theirs.shape:
+            return None
+        found = np.zeros(self.n_local, dtype=np.int32)
+        found[own] = theirs
+        return found if np.array_equal(found[own], theirs) else None
 
     def rows(self, values: AnyArray) -> Any:
         """Owned values of all unknowns ``(n,)`` in the rows of vectors ``(n_rows, gdim)`` (a view)."""

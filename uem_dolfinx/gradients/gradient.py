@@ -23,6 +23,7 @@ from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_expression, check_functional, check_parts
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.gradients.assemblies import constants_of
+from uem_dolfinx.gradients.contact_fields import check_field, fields_of
 from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.gradients.refused import refuse_assembly, refuse_parameter, refuse_shape
 from uem_dolfinx.parallel import agreed, ask_together, reduced
@@ -242,6 +243,8 @@ def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
                 check_expression(f"{what}[{i}]", control, problem.config.mesh.ufl_domain(), "the displacement's mesh")
             if isinstance(control, ufl.SpatialCoordinate):
                 _check_shape(problem)
+            if isinstance(control, fem.Function):
+                check_field(problem, f"{what}[{i}]", control)
             if isinstance(control, ContactParameter):
                 _check_parameter(problem, f"{what}[{i}]", control)
         for i, (control, change) in enumerate(found if what == "direction" else ()):
@@ -290,7 +293,8 @@ def refuse_idle_controls(
     problem: UnitedProblem, what: str, controls: Sequence[Any], functionals: Sequence[ufl.Form] = ()
 ) -> None:
     """Refuse Constants and Functions that occur neither in the problem nor in a functional (collective)."""
-    forms, beside = [problem.bodies.F, *functionals], [problem.dynamics, problem.materials, constants_of(problem)]
+    forms = [problem.bodies.F, *functionals]
+    beside = [problem.dynamics, problem.materials, constants_of(problem), fields_of(problem)]
     n, bcs = len(problem.u.x.array), problem.bodies.bcs
     for i, m in enumerate(controls):
         if not isinstance(m, (fem.Constant, fem.Function)):
@@ -396,5 +400,10 @@ def _check_shape(problem: UnitedProblem) -> None:
                     "expected coupling='node_to_surface', or tetrahedra"
                 )
     refuse_shape(problem)
-    if any(contact.adjust or callable(contact.offset) for contact in problem.contacts):
-        raise InputError("a gradient by the shape needs an offset that is a number, and no adjust: others change with the shape")
+    if any(
+        contact.adjust or (callable(contact.offset) and not isinstance(contact.offset, fem.Function))
+        for contact in problem.contacts
+    ):
+        raise InputError(
+            "a gradient by the shape needs an offset that is a number or a Function, and no adjust: others change with the shape"
+        )

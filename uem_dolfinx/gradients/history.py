@@ -224,14 +224,15 @@ class History(given.Sealed):
         load = problem.load if isinstance(problem.load, Mapping) else {}
         density = None if dynamics is None else dynamics.mass.density
         made_of = [] if density is None else list(traverse_unique_terminals(density))
-        varied = [c.name for c in problem.contacts if c.pair.frictional and callable(as_law(c.friction).field)]
+        fields = {c.name: as_law(c.friction).field for c in problem.contacts if c.pair.frictional}
+        varied = [name for name, f in fields.items() if callable(f) and not isinstance(f, fem.Function)]
         with agreed(problem.comm):
             refuse_kept_projections(problem, len(self))
             for k, m in enumerate(controls):
                 if isinstance(m, ufl.SpatialCoordinate) and varied:
                     raise InputError(
                         f"controls[{k}] is the shape, with which the friction of contact '{varied[0]}', a function of place, changes: "
-                        "there is no derivative by it; expected a number"
+                        "there is no derivative by it; expected a number or a Function"
                     )
                 if isinstance(m, fem.Constant) and (callable(load.get(m)) or any(m is one for one in self._by_function)):
                     raise InputError(

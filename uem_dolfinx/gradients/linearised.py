@@ -47,6 +47,7 @@ from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
+from uem_dolfinx.gradients.contact_fields import along_field
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
 from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of, rubbed, thickened, turned_by
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
@@ -272,11 +273,10 @@ class Linearised:
             Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
         """
         k, pair, config = self.problem.contacts.index(m.contact), m.contact.pair, self.config
-        gaps, first = np.zeros_like(self.multipliers), sum(len(own) for own in self.equations[:k])
+        gaps = np.zeros_like(self.multipliers)
         if m.parameter == "friction":
             return gaps, rubbed(pair)
-        self._refuse_replaced(f"contact '{m.contact.name}'", f"its {m.parameter}")
-        own, rows = slice(first, first + len(self.equations[k])), self.equations[k].P
+        own, rows = self.equations_of(k, f"its {m.parameter}"), self.equations[k].P
         if (section := section_of(m.contact)) is not None:
             gaps[own], pushed = by_section(section, m.parameter, len(self.equations[k]))
             return gaps, pushed
@@ -292,6 +292,12 @@ class Linearised:
         if (stiffness := self.stiffness_of([k])) is not None:
             pushed = pushed + forms.product(stiffness, self.vector(b)).array_r[: self._n].reshape(-1, config.gdim)
         return gaps, -pushed
+
+    def equations_of(self, k: int, what: str) -> slice:
+        """Place of a contact's equations among all, if there are derivatives by ``what`` changes their gaps (to be agreed on)."""
+        self._refuse_replaced(f"contact '{self.problem.contacts[k].name}'", what)
+        first = sum(len(own) for own in self.equations[:k])
+        return slice(first, first + len(self.equations[k]))
 
     def _refuse_replaced(self, whose: str, what: str) -> None:
         """Refuse derivatives by gaps if equations have been replaced by others."""
@@ -343,7 +349,12 @@ class Linearised:
                     forces.array[: self._n] -= pushed.ravel()
             if (form := along(self.F, m, change)) is not None:
                 forces.array[:] -= self.assembled(form)
-            values = values_in(m.function_space, change) if isinstance(m, fem.Function) else change
+            values = change
+            if isinstance(m, fem.Function):
+                values = values_in(m.function_space, change)
+                opened, pushed = along_field(self, m, values)
+                gaps += opened
+                forces.array[: self._n] -= pushed.ravel()
             prescribed += self.ramp * self.prescribed_by(m, values)
         shape.x.scatter_forward()
         drawn = self.vector(shape.x.array[: self._n])

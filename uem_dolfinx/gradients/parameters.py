@@ -13,6 +13,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.conditions.rigid_set import turned
 from uem_dolfinx.conditions.united_rows import forces_of
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.friction.sliding import Sliding
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.mortar.placement import MortarKinematics
 from uem_dolfinx.contact.pair.interface import Interface
@@ -82,16 +83,19 @@ def turned_by(entry: tuple[int, ...], v: Array) -> Array:
     return turned(np.eye(3)[entry[0]] if entry else np.ones(1), v)
 
 
-def thickened(pair: Interface, multipliers: Array) -> tuple[Array, Array]:
-    """Derivatives of gaps ``(m,)`` and residual ``(n_owned, gdim)`` by the offset, in which both are linear (collective)."""
+def thickened(pair: Interface, multipliers: Array, along: Array | None = None) -> tuple[Array, Array]:
+    """Derivatives of gaps ``(m,)`` and residual ``(n_owned, gdim)`` by the offset, in which both are linear (collective).
+
+    ``along``: displacements of the owned nodes ``(n_owned, gdim)``, for the work of the residual of each equation instead ``(m,)``.
+    """
     d, kinematics = pair.discretisation, pair.kinematics
     more = THICKER * float(reduced(pair.config.comm, _least_side(pair), op=MPI.MIN))
     before, length = d.offset, pair.kinematics.gap_rows.scale
     try:
-        gap, forces = _gaps_and_forces(pair, multipliers, length)
+        gap, forces = _gaps_and_forces(pair, multipliers, length, along)
         d.set_offset(np.full(len(pair.nodes), more) + (0.0 if before is None else before))
         pair.project()
-        other_gap, other_forces = _gaps_and_forces(pair, multipliers, length)
+        other_gap, other_forces = _gaps_and_forces(pair, multipliers, length, along)
     finally:
         d.set_offset(before)
         pair.kinematics = kinematics
@@ -106,24 +110,43 @@ def _least_side(pair: Interface) -> float:
     return float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).min(initial=pair.config.size))
 
 
-def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array) -> tuple[Array, Array]:
-    """Gaps of equations ``(m,)`` and contact forces at the owned nodes, scaled to another ``length (n,)`` (collective)."""
+def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array, along: Array | None) -> tuple[Array, Array]:
+    """Gaps of equations ``(m,)`` and contact forces, or their work, see ``thickened``, scaled to another ``length (n,)`` (collective)."""
     if isinstance(pair.discretisation, Mortar) and isinstance(pair.kinematics, MortarKinematics):
         pair.kinematics = pair.discretisation.with_variation(pair.kinematics)
     own, config = pair.equations(), pair.config
     longer = (pair.kinematics.gap_rows.scale / length)[own.contactor]
-    return own.P.gap * longer, forces_of(config, own.Q, multipliers * longer)
+    if along is None:
+        return own.P.gap * longer, forces_of(config, own.Q, multipliers * longer)
+    forces, there = own.Q.forces(multipliers * longer), config.ask_owners(own.Q.followed, along)
+    work = np.einsum("mg,mg->m", forces[: len(own)], along[own.Q.node])
+    work += np.bincount(own.Q.row, np.einsum("kg,kg->k", forces[len(own) :], there), len(own))
+    return own.P.gap * longer, work
 
 
 def rubbed(pair: Interface) -> Array:
     """Derivative of the residual by the coefficient of friction ``(n_owned, gdim)`` (collective)."""
-    sliding = pair.friction
-    assert sliding is not None
+    nodes, forces = _sliding(pair).frame.ties.handed_on(_rubbed(pair))
+    return pair.config.add_at_owners(nodes, forces)
+
+
+def rubbed_along(pair: Interface, a: Array) -> Array:
+    """Work of the residual's derivative by the coefficient at each contactor along ``a (n_owned, gdim)``: ``(n,)`` (collective)."""
+    return np.einsum("ng,ng->n", _rubbed(pair), _sliding(pair).frame.ties.relative(a))
+
+
+def _rubbed(pair: Interface) -> Array:
+    """Derivatives of tangential multipliers by the coefficient ``(n, gdim)`` (collective)."""
+    sliding = _sliding(pair)
     if reduced(pair.config.comm, bool((sliding.value == 0.0).any()), op=MPI.LOR):
         raise InputError(
             f"{pair.name}: some contactors have no friction in a step, where the coefficient has a one-sided derivative: expected a "
             "positive coefficient everywhere"
         )
     share = sliding.slipping(pair.trial) * pair.trial.lam / pair.kinematics.force_per_multiplier
-    nodes, forces = sliding.frame.ties.handed_on(share[:, None] * sliding.directions(pair.trial))
-    return pair.config.add_at_owners(nodes, forces)
+    return np.asarray(share[:, None] * sliding.directions(pair.trial))
+
+
+def _sliding(pair: Interface) -> Sliding:
+    assert pair.friction is not None
+    return pair.friction

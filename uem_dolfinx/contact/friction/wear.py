@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices
@@ -62,6 +63,7 @@ class Wear:
         words = f"contact '{name}': wear"
         if tag.dim == 0:
             raise InputError(f"{words} needs areas, and points have none: give facets")
+        given.kind(words, k, not isinstance(k, fem.Function), "a number or a function of position")
         self._config, self._nodes, self._lower, self._name, self._warned = config, nodes, lower, name, False
         self.k = asked_at(config, nodes, words, k, given.NOT_NEGATIVE) if callable(k) else np.full(len(nodes), k)
         surface = TargetFacets(config, tag, "contactor")

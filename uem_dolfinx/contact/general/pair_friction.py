@@ -9,7 +9,7 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.laws.law import FrictionLaw, as_law, follows_load, given_friction, parameters, values_at
+from uem_dolfinx.contact.laws.law import FrictionLaw, as_law, given_friction, is_read_again, parameters, values_at
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.skin import Skin
 
@@ -35,12 +35,12 @@ class FrictionOfPairs:
         laws = [law for *_, law in self.pairs] + [self.others] * (None in friction)
         self.law = (laws or [self.others])[0]
         expected = (
-            f"values for one law, as {type(self.law).__name__}, that differ in its first parameter alone, and follow no load or "
-            "temperature"
+            f"values for one law, as {type(self.law).__name__}, that differ in its first parameter alone, numbers or functions "
+            "of position"
         )
         for law in laws:
             alike = type(law) is type(self.law) and parameters(law)[1:] == parameters(self.law)[1:]
-            given.kind("friction by pairs", law, alike and not follows_load(law), expected)
+            given.kind("friction by pairs", law, alike and not is_read_again(law), expected)
 
     @staticmethod
     def _pair(key: Any) -> tuple[Any, Any]:

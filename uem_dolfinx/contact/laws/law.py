@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeAlias, TypeGuard, cast
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices
@@ -24,7 +25,8 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
 #: A number, or a function of position, called with reference points ``(3, n)``, that returns ``(n,)``; or a function of position
-#: and of load factor or time that returns ``(n,)`` or a number; or an ``OfTemperature``.
+#: and of load factor or time that returns ``(n,)`` or a number; or a scalar ``fem.Function`` of the displacement's nodes; or an
+#: ``OfTemperature``.
 Field: TypeAlias = float | Callable[..., npt.ArrayLike]
 
 
@@ -193,6 +195,11 @@ def parameters(law: FrictionLaw) -> list[Any]:
     return [law.field, *others]
 
 
+def is_read_again(law: FrictionLaw) -> bool:
+    """Whether the law's parameter is read at every step: it follows the load, or is a Function, whose values may have changed."""
+    return isinstance(law.field, fem.Function) or follows_load(law)
+
+
 def follows_load(law: FrictionLaw) -> bool:
     """Whether the law's parameter is a function of position and load factor or time, or also of temperature."""
     if not callable(law.field) or isinstance(law.field, OfTemperature):
@@ -238,25 +245,35 @@ def values_at(
         return np.full(n, law.field) if law.field > 0 else None
     words, more = f"contact '{name}': friction", ((at,) if T is None else (at, T)) if follows_load(law) else ()
     value = asked_at(config, nodes, words, law.field, given.NOT_NEGATIVE, *more)
-    return value if more or reduced(config.comm, int((value > 0).any())) else None
+    return value if is_read_again(law) or reduced(config.comm, int((value > 0).any())) else None
 
 
 def asked_at(
     config: Configuration, nodes: Indices, words: str, f: Callable[..., npt.ArrayLike], within: given.Range, *more: Any
 ) -> Array:
-    """Values of a function of position, named by ``words``, at the reference positions of ``nodes (n,)``: ``(n,)`` (collective).
+    """Values of a field, named by ``words``, at ``nodes (n,)``: ``(n,)`` (collective).
 
     Args:
         config: configuration of the displacement.
         nodes: owned nodes ``(n,)``.
         words: for messages.
-        f: the function.
+        f: a Function, or a function of position, which is given the reference positions.
         within: allowed values.
         more: further arguments, load factor or time, and temperatures ``(n,)``; the function may then return one number.
 
     Raises:
-        InputError, UserFunctionError: if it does not return n numbers in the range, or raises.
+        InputError, UserFunctionError: if it does not return n numbers in the range, or raises; for a Function of other nodes.
     """
+    if isinstance(f, fem.Function):
+        with agreed(config.comm):
+            entries = config.entries_in(f.function_space)
+            expected = "a scalar Function with the displacement's nodes, of its degree and on its mesh"
+            given.kind(words, f, entries is not None, expected)
+            assert entries is not None
+            value = np.array(f.x.array[entries[nodes]])
+            if not within.holds(value).all():
+                raise InputError(f"{words}, the Function '{f.name}', has values that are not {within.words.replace('a ', '')}")
+        return value
     n = len(nodes)
     places = np.zeros((3, n))
     places[: config.gdim] = config.X[nodes].T

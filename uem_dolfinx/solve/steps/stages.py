@@ -21,6 +21,7 @@ from uem_dolfinx.contact.switched import (
     hold,
     leave_friction,
     leave_preload,
+    refuse_ramp,
     settle,
     switch_off,
     switch_on,
@@ -85,6 +86,9 @@ def _check(problem: UnitedProblem, step: Step, words: str) -> None:
                 f"{words}: contact '{contact.name}' was made without friction: make it with the friction that it is to have, and give "
                 "an earlier step friction 0"
             )
+        refuse_ramp(f"{words}: friction of contact '{contact.name}'", before.field, law.field)
+    for contact, end in step.offset.items():
+        refuse_ramp(f"{words}: offset of contact '{contact.name}'", contact.offset, end)
     for contact, on in step.contacts.items():
         if isinstance(contact, Preload):
             raise InputError(f"{words}: preload '{contact.name}' cannot be switched: give the step preload = {{preload: 0.0}}")
