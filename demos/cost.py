@@ -13,8 +13,8 @@ Options:
 # %% [markdown]
 # # Contact for the price of a few linear solves
 #
-# A cylinder on a block (2D) and a sphere on a block (3D), meshed by Gmsh with more and more unknowns, each solved twice with the
-# same solver and tolerance, from the making of the problem to its last state:
+# A cylinder on a block (2D) and a sphere on a block (3D) are meshed by Gmsh with more and more unknowns. Each is solved twice
+# with the same solver and tolerance, from the making of the problem to its last state:
 #
 # - *with contact*: pressed together by Dirichlet conditions, in one load step from scratch;
 # - *without*: no contact, and a body force, so that there is something to solve. What is prescribed would only move the bodies.

@@ -134,10 +134,10 @@ if args.coupling == "node_to_surface":
 
 # %% [markdown]
 # ## The cases of mortar
-# Meshes n:m that are not nested, nodes moved at random, a lower block that is wider and ends its contact within a facet, of which
-# that leaves a part, or as little as a hundredth; and each side once as contactor. In 3D the wider block is of hexahedra.
-# Uniting in integrals does not spoil the condition of the system: beside it is the largest eigenvalue of the bodies without contact over
-# the smallest of one body of their shape, with the finer cells.
+# Meshes n:m that are not nested; nodes moved at random; a wider lower block, whose contact ends within a facet and covers a part
+# of it, or only a hundredth; and each side once as contactor. In 3D the wider block is of hexahedra. Uniting in integrals does
+# not spoil the condition of the system: beside it is the largest eigenvalue of the bodies without contact over the smallest of
+# one body of their shape, with the finer cells.
 
 # %%
 if args.coupling == "mortar":

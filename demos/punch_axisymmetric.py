@@ -9,11 +9,11 @@ Options:
 # %% [markdown]
 # # A rounded punch on a cylinder
 #
-# A punch of steel (E = 210 GPa, radius 50 mm, height 100 mm, its edge rounded by 10 mm) stands on a cylinder of aluminium (70 GPa, radius
-# 100 mm, height 200 mm) that is held at its bottom; nu = 0.3, and 100 MPa press on the punch, without friction and with mu = 0.1. It is
-# benchmark 2 of A. Konter, *Advanced Finite Element Contact Benchmarks* (NAFEMS R0094, 2006), and test SSNA122 of code_aster, which
-# compares the settlement at M, the middle of the cylinder's face: with quadratic cells (model B) -0.132941 mm and -0.130794 mm, of the
-# law of St Venant-Kirchhoff under a dead load.
+# A punch of steel (E = 210 GPa, radius 50 mm, height 100 mm, its edge rounded by 10 mm) stands on a cylinder of aluminium. The
+# cylinder (70 GPa, radius 100 mm, height 200 mm) is held at its bottom; nu = 0.3, and 100 MPa press on the punch, without
+# friction and with mu = 0.1. It is benchmark 2 of A. Konter, *Advanced Finite Element Contact Benchmarks* (NAFEMS R0094, 2006),
+# and test SSNA122 of code_aster, which compares the settlement at M, the middle of the cylinder's face: with quadratic cells
+# (model B) -0.132941 mm and -0.130794 mm, of the law of St Venant-Kirchhoff under a dead load.
 #
 # These are figures of one mesh: at the end of the flat face pressures rise to six times their mean over less than a millimetre, and every
 # mesh without cells as small is too stiff there. code_aster's linear cells (model A) give -0.130734 mm and -0.128580 mm. The mesh is not

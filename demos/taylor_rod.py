@@ -16,11 +16,11 @@ Options:
 # %% [markdown]
 # # Taylor's rod
 #
-# A copper rod of 32.4 mm in length and 3.2 mm in radius flies against a rigid wall without friction. A plastic wave runs up the rod, and
-# after 80 microseconds it has come to rest, a third shorter and twice as thick at its foot [Taylor, Proceedings of the Royal Society A
-# 194 (1948) 289-299; Wilkins and Guinan, Journal of Applied Physics 44 (1973) 1200-1206]. Codes agree on the length, 21.4 to 21.5 mm, and
-# nearly on the radius of the foot, 7.0 to 7.2 mm [Kamoulakos, Benchmark (1990); Zhu and Cescotto, International Journal for Numerical
-# Methods in Engineering 38 (1995) 3945-3973].
+# A copper rod of 32.4 mm in length and 3.2 mm in radius flies against a rigid wall without friction. A plastic wave runs up the
+# rod. After 80 microseconds the rod is at rest, a third shorter and twice as thick at its foot [Taylor, Proceedings of the Royal
+# Society A 194 (1948) 289-299; Wilkins and Guinan, Journal of Applied Physics 44 (1973) 1200-1206]. Codes agree on the length,
+# 21.4 to 21.5 mm, and nearly on the radius of the foot, 7.0 to 7.2 mm [Kamoulakos, Benchmark (1990); Zhu and Cescotto,
+# International Journal for Numerical Methods in Engineering 38 (1995) 3945-3973].
 #
 # The wall is imposed in two ways. By contact the foot may leave it: its rim, thrown outwards, lifts off and curls up. Held by
 # Dirichlet conditions the foot stays flat. Here contactors keep their mass, as they do in the codes compared, and the touch itself

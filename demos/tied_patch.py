@@ -78,9 +78,9 @@ error = max(max(found.values()) for found in errors.values())
 
 # %% [markdown]
 # ## The cantilever
-# A beam of two parts that are tied in the middle, with n and n + 1 cells over the height, against one piece with n, and Timoshenko's
-# deflection P l^3 / (3 E I) + P l / (5/6 G A) of the end. All are of degree 2, in plane stress; finite strain makes no difference at
-# this load.
+# A beam of two parts that are tied in the middle, with n and n + 1 cells over the height, is compared with one piece with n
+# cells. The deflection of the end by Timoshenko is P l^3 / (3 E I) + P l / (5/6 G A). All are of degree 2, in plane stress;
+# finite strain makes no difference at this load.
 
 
 # %%

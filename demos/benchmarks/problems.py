@@ -192,9 +192,9 @@ def cattaneo(h: float) -> Scene:
 def indenter(N: int) -> Scene:
     """A rigid paraboloid pressed into a block, see ``hertz_penalty.py``: one mesh of N x N x N/2 hexahedra, CG with multigrid.
 
-    Multipliers get a factorisation instead, since MINRES did not converge. All methods share one mesh and its error, so that
-    they are compared with the exact solution of the discrete problem, which is found by elimination with a direct solver to
-    rounding, one for each coupling; springs spread over the surface lead to another discrete problem, for which it is no answer.
+    Multipliers get a factorisation instead, since MINRES did not converge. All methods share one mesh and its error. So they are
+    compared with the exact solution of the discrete problem, one for each coupling, found by elimination with a direct solver to
+    rounding; springs spread over the surface lead to another discrete problem, for which it is no answer.
     """
     E, R, d = 10.0, 0.5, 0.02
     mesh, tags = uem.read_gmsh(common.MESHES / "hertz_penalty.geo", comm, gdim=3, parameters={"N": N})

@@ -1,7 +1,7 @@
 """Scenes of boxes, of the extreme cases and of the tests, from DOLFINx alone: bodies, named surfaces and Dirichlet conditions.
 
-Surfaces and nodes are found by their places in the *drawing*, before a scene is turned, scaled or renumbered, so that one can look at
-the same scene in many poses and on any number of ranks.
+Surfaces and nodes are found by their places in the *drawing*, before a scene is turned, scaled or renumbered. So the same scene
+can be solved in many poses and on any number of ranks.
 """
 
 from __future__ import annotations

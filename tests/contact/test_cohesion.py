@@ -177,8 +177,8 @@ def test_friction_on_the_damaged_part():
 def test_split_beam(coupling, load):
     """A clamped split beam, bent at both arms (pure shear, end-notched flexure's half) or at one (shear 3 to 4 in energy).
 
-    With the compliance ``(k a^3 + L^3) / (2 E' h^3) + 3 L / (5 G h)`` of beam theory, k = 3 or 7, force and displacement give the length
-    of the crack, and the energy release rate ``P^2 / 2 dC/da``: that of the bond while it grows.
+    Force and displacement give the length of the crack by the compliance ``(k a^3 + L^3) / (2 E' h^3) + 3 L / (5 G h)`` of beam
+    theory, k = 3 or 7. The energy release rate is then ``P^2 / 2 dC/da``: that of the bond while it grows.
     """
     L, h, E, nu, both = 100.0, 5.0, 70e3, 0.3, load == "shear"
     strength, G, G2 = (24.0, 0.333, 1.0) if both else (20.0, 1.0, 3.0)

@@ -87,7 +87,7 @@ class Slider:
 def test_a_block_on_a_spring_sticks_and_slips(law):
     """Static and kinetic coefficients: period and reach of the limit cycle, each to what a step can tell.
 
-    With ``D = (mu_s - mu_k) N / k`` and w the block's frequency on the spring, it sticks for ``2 D / V`` and slips for
+    Let ``D = (mu_s - mu_k) N / k`` and w be the block's frequency on the spring. The block sticks for ``2 D / V`` and slips for
     ``(2 pi - 2 atan(w D / V)) / w``, about ``mu_k N / k`` by the amplitude ``sqrt(D^2 + (V / w)^2)``.
     """
     V, k, dt = 0.5, 40.0, 0.02

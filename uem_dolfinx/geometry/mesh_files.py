@@ -47,9 +47,9 @@ def read_mesh(
 
     Files of Gmsh, ``.geo`` and ``.msh``, are read as ``read_gmsh`` does; input files ``.inp`` of Abaqus and CalculiX with their sets and
     surfaces; all others by meshio: Exodus ``.e`` and ``.exo``, ``.vtu``, Nastran ``.bdf``, XDMF and more. Sets of cells and of facets
-    become tags by their names, and so does every value of whole numbers that cells have, as ``"material 2"``. A set of nodes becomes a
-    tag of exterior facets if it has all nodes of these and no others, and one of points otherwise, whose nodes are those of the set,
-    also in the middle of edges, faces and cells.
+    become tags by their names, and so does every value of whole numbers that cells have, as ``"material 2"``. A set of nodes
+    becomes a tag of exterior facets if it has all nodes of these and no others. Otherwise it becomes a tag of points with
+    exactly its nodes, also in the middle of edges, faces and cells.
 
     Serendipity cells (``C3D20``, ``CPS8``, HEX20, QUAD8) are made complete: nodes are added in the middle of quadrilaterals and
     hexahedra, where the cells' own map takes these, so that they keep their shape.

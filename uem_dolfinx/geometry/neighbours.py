@@ -1,8 +1,8 @@
 """Lists of the facets that each surface node may touch, rebuilt only after a body has moved far enough.
 
-A facet may hold a node if its body comes after the node's own in the order, if it faces the node, and if the node was in front of
-it in the last accepted state. Nodes at sharp edges follow in both directions, since they could otherwise penetrate between the
-nodes of the other surface. Facets that are not listed cost nothing.
+A facet may hold a node if three conditions are met: its body comes after the node's own in the order, it faces the node, and the
+node was in front of it in the last accepted state. Nodes at sharp edges follow in both directions, since they could otherwise
+penetrate between the nodes of the other surface. Facets that are not listed cost nothing.
 """
 
 from __future__ import annotations

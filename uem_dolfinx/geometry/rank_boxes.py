@@ -1,7 +1,7 @@
 """Which ranks have a surface near which points: bounding boxes of all ranks' parts, known to every rank.
 
-Only boxes near the box around all points of this rank are compared with single points, so that time and memory go with the points and
-with the parts nearby, not with the number of ranks.
+Only boxes near the box around all points of this rank are compared with single points. So time and memory grow with the points
+and the parts nearby, not with the number of ranks.
 """
 
 from __future__ import annotations

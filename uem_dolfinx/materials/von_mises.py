@@ -58,8 +58,8 @@ class VonMises(given.Sealed):
     layer with its own history.
 
     Plastic flow is isochoric, so that some cells lock. Except in plane stress, the pressure, which is elastic in this law, is therefore
-    integrated by a separate rule. Errors of the limit load of Prandtl's punch in plane strain, perfectly plastic with a yield strain of
-    0.001 and an indentation of 0.03 of its width, on 8 linear or 4 quadratic cells beneath half of it:
+    integrated by a separate rule. Errors of the limit load of Prandtl's punch in plane strain, perfectly plastic with a yield
+    strain of 0.001. The indentation is 0.03 of the width, with 8 linear or 4 quadratic cells beneath half of it:
 
     - degree 1 on quadrilaterals and hexahedra, 5.6 %: stress at 2 points per direction, pressure at the cell's centre, which is the
       B-bar method (Hughes, Int. J. Numer. Meth. Engng 15 (1980) 1413-1418); with the pressure at the stress's points it would be

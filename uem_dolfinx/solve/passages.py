@@ -2,9 +2,9 @@
 
 The check uses the converged step, not the Newton iterates: straight paths of contactors and target from the committed to the new
 configuration. A contactor passes if it enters the target through one face and leaves it through another that faces away from the first.
-Contactors that only cut an edge or a crest, or slide past an end, are accepted in statics; in dynamics they have missed an impact. A
-contactor that touches at the end of the step has reached the wrong face if it comes from behind this face, or from the sector in front
-of both faces of an edge, since its straight path then does not determine which face it meets.
+Contactors that only cut an edge or a crest, or slide past an end, are accepted in statics; in dynamics they have missed an
+impact. A contactor that touches at the end of the step has reached the wrong face in two cases: it comes from behind this face,
+or from the sector in front of both faces of an edge. In the second case its straight path does not determine which face it meets.
 
 For a body that may touch itself, paths are straight relative to its facets, and each facet rotates with its surroundings. So a body that
 rotates, rolls or bends does not approach itself, and the surface around a facet moves with it.

@@ -1,9 +1,9 @@
 """The interface of a contact with cohesion: hard contact, and bonds whose tractions follow the openings until they are separated.
 
-With the mean opening w_i of a bond, its area A_i and the law t(w, damage) the residual is ``F + sum_i A_i r_i t_i`` with the gradients
-r_i of w_i, and its derivative has the terms ``sum_i A_i r_i (dt/dw) r_i'``, and the second derivatives of gaps that are kept. Both
-bodies are in the rows: action equals reaction. Contactors that close are united as in hard contact, where bonds have no traction along
-the normal. Normals are those at the beginning of the step, so that derivatives are exact.
+With the mean opening w_i of a bond, its area A_i and the law t(w, damage) the residual is ``F + sum_i A_i r_i t_i`` with the
+gradients r_i of w_i. Its derivative has the terms ``sum_i A_i r_i (dt/dw) r_i'`` and the second derivatives of gaps that are
+kept. Both bodies are in the rows: action equals reaction. Contactors that close are united as in hard contact, where bonds have
+no traction along the normal. Normals are those at the beginning of the step, so that derivatives are exact.
 
 Damage is committed with the step. With friction, limits are those of the damaged part, by the damage at the beginning of the step.
 """

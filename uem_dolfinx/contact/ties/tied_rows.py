@@ -10,8 +10,8 @@ facets, weighted with dual functions psi_i, whose integrals with the contactor's
 
     sum_j C_ij x_j - int psi_i (sum_a N_a x_a + h n) = 0.
 
-If Dirichlet conditions prescribe a component of a contactor and of the nodes that it follows, as on a plane of symmetry, its dual
-function is added to the function of a neighbour, for this component.
+Dirichlet conditions may prescribe a component of a contactor and of the nodes that it follows, as on a plane of symmetry. For
+this component its dual function is then added to the function of a neighbour.
 """
 
 from __future__ import annotations
@@ -279,7 +279,7 @@ def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
     """Dual functions for each component (collective).
 
     If a node and the nodes that it follows are prescribed, as on a plane of symmetry, its function is added to the functions of
-    other nodes, since its equation would constrain nodes next to the plane. Facets with all nodes prescribed are excepted.
+    other nodes. Its own equation would constrain nodes next to the plane. Facets with all nodes prescribed are excepted.
 
     Args:
         d: of the contactors.

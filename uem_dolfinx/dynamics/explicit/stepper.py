@@ -120,8 +120,8 @@ class ExplicitStepper:
     def critical_step(self) -> float:
         """Longest stable step in the present state, infinite without stiffness (collective).
 
-        With the largest eigenvalues k and c of stiffness and damping over mass it is ``2 / r`` of ``r^2 = k + r c``, since damping forces
-        are those of the velocity in the middle of the step before.
+        With the largest eigenvalues k and c of stiffness and damping over mass it is ``2 / r`` of ``r^2 = k + r c``. Damping
+        forces are those of the velocity in the middle of the step before.
         """
         # committed stresses are on the yield surface, from where the tangent is elastic, as it is in unloading
         self.problem.bodies.restore()

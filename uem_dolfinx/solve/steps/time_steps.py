@@ -50,15 +50,15 @@ def time_steps(
 ) -> Iterator[TimeStep]:
     """Step through time, with steps that end at multiples of ``dt`` after the start, behind a progress bar on a terminal.
 
-    A step is halved when it does not converge, when a contactor would pass through a target within it, or when contacts would add
-    energy to the bodies within it, and increased again after easy steps.
+    A step is halved when it does not converge, when a contactor would pass through a target, or when contacts would add energy
+    to the bodies. After easy steps it is increased again.
 
     Args:
         problem: with ``dynamics``; its ``load`` is called with the time.
         dt: nominal length of the steps; with ``CentralDifferences`` None chooses the longest ones that are safe.
         end: time to reach.
-        tolerance: shorten steps to dt/2, dt/4, ... until the local error of a step is below this part of the way that the bodies move in
-            it at their largest speed so far, and lengthen them again up to ``dt`` where it is much smaller; see
+        tolerance: shorten steps to dt/2, dt/4, ... until the local error of a step is below this part of the distance that the
+            bodies cover in it at their largest speed so far. They are lengthened again up to ``dt`` where the error is much smaller; see
             ``Dynamics.rate_error``. The period of a vibration has about this error. None: steps have the length ``dt``.
         event_tolerance: find the instants at which a contact closes or opens to this part of ``dt``. The step is divided there, so
             that a step begins at the instant, unless rounding exceeds the forces of such short steps. None: steps are not divided.
