@@ -41,7 +41,7 @@ pull_off = 1.5 * np.pi * w * R
 
 # %% [markdown]
 # ## The scene
-# Where surfaces overlap at first, the edge of the contact moves node by node within a step, hence many iterations are allowed.
+#
 # The sphere stays where it is, pressed into the block's top at first; the block's bottom moves down. Near the contact the sphere is a
 # paraboloid, as in the theory. The block is as high and wide as R, ten times the contact radius.
 
@@ -69,7 +69,7 @@ law = uem.Adhesion(w, strength)
 contact = uem.Contact(tags["top"], sphere, cohesion=law, coupling=args.coupling, sliding="small", name="sphere")
 bcs = [uem.dirichlet(V, tags["axis"], 0), uem.dirichlet(V, tags["bottom"], value=base)]
 F = uem.LinearElastic(E, nu, kind="axisymmetric").residual(u, v) * ufl.dx
-how = {"bcs": bcs, "contacts": [contact], "load": move, "max_iterations": 200, "petsc_options_prefix": "sticky_sphere_"}
+how = {"bcs": bcs, "contacts": [contact], "load": move, "max_iterations": 100, "petsc_options_prefix": "sticky_sphere_"}
 problem = uem.UnitedProblem(F, u, **how)
 
 # %% [markdown]

@@ -14,24 +14,19 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.laws.adhesion import Adhesion
-from uem_dolfinx.contact.pair.cohesive import MOST_EXCHANGED, together
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.cohesive import SofteningInterface, together
 from uem_dolfinx.contact.pair.soft import stiffness_of_gaps
-from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.seam.state import PairState
 
 
-class AdhesiveInterface(Interface):
+class AdhesiveInterface(SofteningInterface):
     """Contactors that are attracted by their target; other arguments as for ``Interface``.
 
     Args:
         law: attraction by the gap.
         contact: that it belongs to, for ``measured_areas`` and ``leads``.
     """
-
-    #: Its forces store and release energy.
-    works = True
 
     def __init__(self, *args: Any, law: Adhesion, contact: Any, **how: Any):
         super().__init__(*args, **how)
@@ -40,8 +35,8 @@ class AdhesiveInterface(Interface):
         self.trial = self.committed = replace(self.committed, cohesion=np.zeros((n, 2)))
         #: Multipliers of the rows of gaps, negative in attraction, and stiffnesses ``(n,)``.
         self._pull = self._stiffness = np.zeros(n)
-        #: Exchanges since the last placement, and whether softening is left out of the derivative in this step.
-        self._exchanged, self._convex = 0, False
+        #: Linearised problems of this step still without softening, this one too, and their number the next time.
+        self._convex, self._next = 0, 1
 
     def activate_touching(self) -> None:
         """See ``Interface``; a contact that was switched off attracts again."""
@@ -56,20 +51,18 @@ class AdhesiveInterface(Interface):
         share = self.kinematics.pressure_map(False).force
         a, slope = self._law.attraction(self.kinematics.gap_rows.equations.gap[: len(share)] / share)
         area = np.where(self.off | ~self._contact.leads(), 0.0, self._contact.measured_areas())
+        self._exchanged, self._convex = 0, max(self._convex - 1, 0)
         self._pull, self._stiffness = -area * a / share, area * (0.0 if self._convex else slope) / share**2
-        self._exchanged = 0
 
-    def exchange(self, violated: Violations) -> None:
-        """See ``Interface``; where exchanges do not end, softening has made the problem indefinite, and is left out in this step."""
-        super().exchange(violated)
-        self._exchanged += 1
-        if self._exchanged == MOST_EXCHANGED:
-            self._convex, self._stiffness = True, 0.0 * self._stiffness
+    def _make_convex(self) -> None:
+        """Leave softening out of this linearised problem and the next ones of this step, each time of twice as many."""
+        if not self._convex:
+            self._convex, self._next, self._stiffness = self._next, 2 * self._next, 0.0 * self._stiffness
 
     def restore(self) -> None:
         """See ``Interface``."""
         super().restore()
-        self._convex = False
+        self._convex, self._next = 0, 1
 
     def _pulled(self) -> Array:
         """Forces of attraction on the contactors ``(n, gdim)`` (collective)."""

@@ -10,6 +10,9 @@ Damage is committed with the step. With friction, limits are those of the damage
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -28,7 +31,7 @@ from uem_dolfinx.parallel import reduced
 #: bodies come down to another equilibrium where the path jumps.
 #: [bound; changes in a step; -]
 MOST_SWINGS = 6
-#: After so many exchanges of contactors in one linearised problem all bonds get it, which makes the problem convex.
+#: After so many exchanges of contactors in one linearised problem softening is left out of it, which makes the problem convex.
 #: [bound; exchanges; -]
 MOST_EXCHANGED = 4
 #: Columns of the state: damage, delayed damage, the load factor or time that it belongs to, and whether damage has grown in the last step;
@@ -36,16 +39,44 @@ MOST_EXCHANGED = 4
 DAMAGE, DELAYED, AT, GREW, PERMANENT = range(5)
 
 
-class CohesiveInterface(Interface):
+class SofteningInterface(Interface):
+    """Contactors with forces that soften as gaps open, which can make linearised problems indefinite."""
+
+    #: Its forces store and dissipate or release energy.
+    works = True
+    #: Exchanges since the last placement.
+    _exchanged = 0
+    #: Whether bodies may come down to another equilibrium, by a stiffness without softening; not along an arc.
+    _may_jump = True
+
+    @contextmanager
+    def along_path(self) -> Iterator[None]:
+        """Keep the whole derivative, with which an arc finds the load, so that bodies do not jump to another equilibrium."""
+        self._may_jump = False
+        try:
+            yield
+        finally:
+            self._may_jump = True
+
+    def exchange(self, violated: Violations) -> None:
+        """See ``Interface``; where exchanges do not end, softening has made the linearised problem indefinite (collective)."""
+        super().exchange(violated)
+        self._exchanged += 1
+        if self._exchanged == MOST_EXCHANGED and self._may_jump:
+            self._make_convex()
+
+    @abstractmethod
+    def _make_convex(self) -> None:
+        """Leave softening out of this linearised problem."""
+
+
+class CohesiveInterface(SofteningInterface):
     """Contactors with bonds, made by ``unite``; other arguments as for ``Interface``.
 
     Args:
         law: of the bonds.
         contact: that it belongs to, for ``surface`` and the present load factor.
     """
-
-    #: Its forces store and dissipate energy.
-    works = True
 
     def __init__(self, *args: Any, law: Cohesive, contact: Any, **how: Any):
         super().__init__(*args, **how)
@@ -54,14 +85,10 @@ class CohesiveInterface(Interface):
         n, g = len(self.nodes), self.config.gdim
         #: Derivatives of the bonds' forces by their equations, and without growth of damage ``(n, gdim, gdim)``.
         self._tangent = self._secant = np.zeros((n, g, g))
-        #: Exchanges since the last placement.
-        self._exchanged = 0
         #: Branch of the law of each bond at the last placement of this step, and how often it has changed ``(n,)``.
         self._branch, self._changes = np.zeros(0, np.int64), np.zeros(n, np.int64)
         #: Openings at the first placement of this step ``(n, gdim)``.
         self._first: Array | None = None
-        #: Whether bodies may come down to another equilibrium, by bonds with the stiffness without growth; not along an arc.
-        self.may_jump = True
         #: Parameter of friction of surfaces without cohesion ``(n,)``.
         self._mu: Array = np.zeros(n) if self.friction is None else self.friction.value
 
@@ -112,14 +139,10 @@ class CohesiveInterface(Interface):
         here = np.where(now.damage >= 1.0, 2, np.where(now.damage > before[:, DAMAGE], 1, 0))
         moved = here != self._branch if len(self._branch) else np.zeros(len(here), bool)
         self._changes, self._branch = self._changes + moved, here
-        return (self._changes > MOST_SWINGS) & self.may_jump
+        return (self._changes > MOST_SWINGS) & self._may_jump
 
-    def exchange(self, violated: Violations) -> None:
-        """See ``Interface``; where exchanges do not end, growing damage has made the problem indefinite (collective)."""
-        super().exchange(violated)
-        self._exchanged += 1
-        if self._exchanged == MOST_EXCHANGED and self.may_jump:
-            self._tangent = self._secant
+    def _make_convex(self) -> None:
+        self._tangent = self._secant
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """Terms of friction, and the stiffness of the bonds; see ``Interface``."""

@@ -9,8 +9,7 @@ measured in the displacement only: other fields, with other units, have no part 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +18,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.laws.law import as_law, follows_load
+from uem_dolfinx.contact.pair.cohesive import SofteningInterface
 from uem_dolfinx.errors import ConvergenceError, InputError
 from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed, reduced
@@ -208,7 +208,10 @@ class AlongArc:
             way = self._way(before - progress.start)
             energy = np.inf if self._by is None else self._by.energy * self.tried / progress.control.nominal
             self._arc.begin(done, (1.0 - progress.dissipating) * way / self._size(way), progress.reach * self.tried, energy)
-            with _without_jumps(problem):
+            with ExitStack() as path:
+                for pair in problem.interfaces:
+                    if isinstance(pair, SofteningInterface):
+                        path.enter_context(pair.along_path())
                 iterations = problem.attempt(along=self._arc)
             factor = self._arc.factor
             spent = self._arc.dissipated(self._way(np.array(problem.u.x.array) - before), factor - done)
@@ -240,19 +243,6 @@ class AlongArc:
     def _size(self, way: Array) -> float:
         """Norm of an increment ``(n_owned * gdim,)`` (collective)."""
         return float(np.sqrt(reduced(self._problem.comm, way @ way)))
-
-
-@contextmanager
-def _without_jumps(problem: UnitedProblem) -> Iterator[None]:
-    """Let bonds keep the tangents with which the arc finds the load."""
-    bonds = [pair for pair in problem.interfaces if hasattr(pair, "may_jump")]
-    for pair in bonds:
-        pair.may_jump = False
-    try:
-        yield
-    finally:
-        for pair in bonds:
-            pair.may_jump = True
 
 
 def _check_values(problem: UnitedProblem) -> None:
