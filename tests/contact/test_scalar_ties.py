@@ -125,4 +125,4 @@ def test_refused():
     problem(tie)()
     refused(uem.SurfaceError, "ties a scalar field", lambda: tie.resultant())
     refused(uem.SpaceError, "belongs to another problem", problem(tie))
-    refused(uem.InputTypeError, "a general contact ties nothing", lambda: uem.GeneralContact(tied=True))
+    refused(uem.InputTypeError, "declare a Contact", lambda: uem.GeneralContact(tied=True))

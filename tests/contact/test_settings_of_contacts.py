@@ -5,6 +5,8 @@ The test to read first is ``test_friction_that_changes_between_steps``.
 
 from __future__ import annotations
 
+from inspect import signature
+
 import numpy as np
 import pytest
 from friction_scenes import driven, history
@@ -83,3 +85,20 @@ def test_what_a_contact_has_not():
     for one in (contact, new):
         for name in ("mu", "offsets", "frictions"):
             refused(uem.InputError, f"no '{name}'", lambda: setattr(one, name, 0.1))
+
+
+#: Values other than the defaults of the arguments for single contacts; ``leak`` is not looked at.
+FOR_SINGLE_CONTACTS = {
+    "sliding": "small", "thickness": 0.1, "tied": True, "offset": 0.1, "adjust": True, "chords": True, "wear": 1e-3,
+    "cohesion": uem.Adhesion(1.0, 1.0), "leak": lambda t: t, "corners": True,
+}  # fmt: skip
+
+
+def test_arguments_for_single_contacts():
+    """A general contact refuses by name what only single contacts have, takes their defaults, and does not know other words."""
+    single, general = (signature(kind).parameters for kind in (uem.Contact, uem.GeneralContact))
+    assert FOR_SINGLE_CONTACTS.keys() == single.keys() - general.keys() - {"contactor", "target"}
+    for word, value in FOR_SINGLE_CONTACTS.items():
+        refused(uem.InputTypeError, (f"{word} = ", "declare a Contact"), lambda w=word, v=value: uem.GeneralContact(**{w: v}))
+        uem.GeneralContact(**{word: single[word].default})
+    refused(TypeError, "unexpected keyword argument 'glue'", lambda: uem.GeneralContact(glue=1))

@@ -19,7 +19,12 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, COUPLINGS, MAX_PENETRATION, Contact
-from uem_dolfinx.contact.general.given_laws import given_edges, refuse_distant_pressures, refuse_open_conductance
+from uem_dolfinx.contact.general.given_laws import (
+    given_edges,
+    refuse_distant_pressures,
+    refuse_open_conductance,
+    refuse_words_of_contact,
+)
 from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
@@ -69,9 +74,10 @@ class GeneralContact(OfProblem, given.Sealed):
         heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
         edges: whether sharp edges of different bodies that cross are held apart in 3D, by one equation at each crossing; None where
             that goes: with ``"node_to_surface"``, without ``normal``, ``heat`` and laws of friction by area.
+        others: further arguments of ``Contact``, such as ``cohesion`` and ``leak``, at their defaults only.
 
     Raises:
-        InputError, InputTypeError: for an unknown word, or numbers out of their range.
+        InputError, InputTypeError: for an unknown word, numbers out of their range, or arguments for single contacts only.
     """
 
     def __init__(
@@ -92,9 +98,10 @@ class GeneralContact(OfProblem, given.Sealed):
         normal: SoftContact | None = None,
         heat: Conductance | Sequence[Conductance] | None = None,
         edges: bool | None = None,
-        tied: None = None,
+        **others: Any,
     ):
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
+            refuse_words_of_contact(others)
             rigid = [rigid] if hasattr(rigid, "project") else rigid
             self.rigid = given.items("rigid", rigid, lambda one: hasattr(one, "project"), "a rigid surface")
             self.exclude = given.items("exclude", exclude, lambda one: one is not None, "a part, or a pair of parts")
@@ -117,7 +124,6 @@ class GeneralContact(OfProblem, given.Sealed):
             self.normal = given_normal(normal, friction, 0.0, self.heats, False)
             law = as_law(friction if self._pairs is None else self._pairs.law)
             self.edges = given_edges(edges, self.coupling, self.normal, self.heats, law)
-            given.kind("tied", tied, tied is None, "None: a general contact ties nothing", "declare a Contact for it")
             if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")
         self.surfaces, self.bodies, self.friction, self.heat = surfaces, dict(bodies or {}), friction, heat

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -10,15 +11,35 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import given
+from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.laws.law import FrictionLaw
-from uem_dolfinx.errors import InputError
+from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.skin import Skin
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.laws.soft import SoftContact
+
+
+def refuse_words_of_contact(others: Mapping[str, Any]) -> None:
+    """Refuse arguments of a ``Contact`` that a general contact has not, unless they have the value of a contact without them.
+
+    Raises:
+        InputTypeError: for such an argument, with the remedy.
+        TypeError: for an argument that a ``Contact`` has not, either.
+    """
+    known = signature(Contact).parameters
+    for word, value in others.items():
+        if word not in known or word in ("contactor", "target"):
+            raise TypeError(f"GeneralContact.__init__() got an unexpected keyword argument '{word}'")
+        usual = known[word].default
+        if value is not usual and not (np.ndim(value) == 0 and value == usual):
+            raise InputTypeError(
+                f"{word} = {given.shown(value)} is for single contacts: declare a Contact of the two surfaces with it, and the general "
+                "contact leaves them to it"
+            )
 
 
 def given_edges(
