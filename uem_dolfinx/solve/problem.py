@@ -244,7 +244,7 @@ class UnitedProblem(given.Sealed):
         for contact in self.contacts:
             contact.begin()
         #: Warnings issued during steps.
-        self.watch = Watch(self.contacts)
+        self.watch = Watch(self.contacts, self.couplings)
         #: Settings of the run, for checkpoints.
         declared = {"equations": equations, "couplings": linked, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in declared.items() if some}
@@ -347,6 +347,7 @@ class UnitedProblem(given.Sealed):
             history = self.converge(self.bodies, self.system, start, fraction, along)
         except UEMError as error:
             stiffness = self.bodies.stiffness
+            self.watch.rigid_sides.advise(error)
             self.restore()
             if isinstance(error, MENDABLE):
                 self.watch.name_corner(stiffness, error)

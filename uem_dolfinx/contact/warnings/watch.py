@@ -12,6 +12,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.both_sides import OfBothSides
 from uem_dolfinx.contact.warnings.checks import sagging, warn_of_sagging_facets, warn_of_slipped
+from uem_dolfinx.contact.warnings.rigid_sides import RigidSides
 from uem_dolfinx.errors import OrientationError, UEMError
 from uem_dolfinx.geometry.facets import facets_of
 from uem_dolfinx.geometry.tags import Tag
@@ -19,6 +20,7 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.seam.state import PairState
@@ -120,10 +122,13 @@ class Watch:
 
     Args:
         contacts: of the problem, which have begun.
+        couplings: of the problem.
     """
 
-    def __init__(self, contacts: Sequence[WatchedContact]):
+    def __init__(self, contacts: Sequence[WatchedContact], couplings: Sequence[RigidCoupling] = ()):
         self._contacts = contacts
+        #: Contactors that couplings make rigid.
+        self.rigid_sides = RigidSides(contacts, couplings)
         if contacts and contacts[0].config.equations:
             from uem_dolfinx.contact.warnings.seams import warn_of_seams
 

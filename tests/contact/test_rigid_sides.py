@@ -1,0 +1,77 @@
+"""Rigid contactors that are finer than a deformable target: a warning before the first step, and the advice that solves the scene.
+
+The test to read first is ``test_a_fine_rigid_contactor_is_named``.
+"""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import pytest
+from body_scenes import surface_of
+from dolfinx import fem
+from helpers import at, box, clamp, linear, run, scene, slow
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+
+COMM = MPI.COMM_WORLD
+WORDS = "the contactor is rigid and finer than its target"
+ADVICE = "make the rigid surface the target"
+
+
+def punch_on_block(cell, across, *, rigid_first, coupling="mortar", degree=1, rigid=True):
+    """A punch with facets of a given part of the block's, pressed by 0.05 onto a block of one unit in height."""
+    g = 2 if cell in ("quadrilateral", "triangle") else 3
+    wide, fine = ([20] if g == 2 else [8, 8]), ([8] if g == 2 else [3, 3])
+    low = box(cell, [-1.0] * (g - 1) + [0.0], [1.0] * g, [*wide, 4])
+    high = box(cell, [-0.4] * (g - 1) + [1.0], [0.4] * (g - 1) + [1.5], [*(round(n / across) for n in fine), 2])
+    s = scene(COMM, cell, [low, high])
+    u = fem.Function(compat.function_space(s.mesh, degree, (g,)))
+    base, top, foot = s.tag("base", 0, at(g - 1, 0.0)), s.tag("top", 0, at(g - 1, 1.0)), s.tag("foot", 1, at(g - 1, 1.0))
+    force = [0.0] * (g - 1) + [-0.05]
+    punch = uem.RigidCoupling(
+        surface_of(s, 1) if rigid else s.tag("lid", 1, at(g - 1, 1.5)), [0.0] * (g - 1) + [1.5], force=force
+    )
+    contact = uem.Contact(*((foot, top) if rigid_first else (top, foot)), coupling=coupling)
+    problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=clamp(u.function_space, base), contacts=[contact], couplings=[punch])
+    return problem, contact
+
+
+def warned(caplog):
+    """How often rank 0 was warned, on all ranks."""
+    return COMM.bcast(sum(WORDS in r.getMessage() for r in caplog.records))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
+@pytest.mark.parametrize("cell", ["quadrilateral", "triangle", "hexahedron"])
+def test_a_fine_rigid_contactor_is_named(caplog, cell, coupling, degree):
+    """Once, before any work; the same scene the other way round is silent and carries the force in a few iterations."""
+    punch_on_block(cell, 0.5, rigid_first=True, coupling=coupling, degree=degree)
+    assert warned(caplog) == 1
+    problem, contact = punch_on_block(cell, 0.5, rigid_first=False, coupling=coupling, degree=degree)
+    assert warned(caplog) == 1
+    if cell == "quadrilateral":
+        (step,) = run(problem)
+        assert len(step.iterations) - 1 <= 6
+        assert contact.resultant().force[1] == pytest.approx(-0.05, rel=1e-6)
+
+
+@pytest.mark.parametrize("across, expected", [(1.0, 0), (0.8, 1), (2.0, 0)])
+def test_equal_facets(caplog, across, expected):
+    """Only shorter facets count, not equal ones; nor does a punch that deforms."""
+    punch_on_block("quadrilateral", across, rigid_first=True)
+    assert warned(caplog) == expected
+    punch_on_block("quadrilateral", 0.5, rigid_first=True, rigid=False)
+    assert warned(caplog) == expected
+
+
+@slow
+@pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
+def test_the_error_says_what_helps(coupling):
+    """The active set of dependent equations cycles; the error advises to exchange the surfaces, not to refine the target."""
+    problem, _ = punch_on_block("quadrilateral", 0.5, rigid_first=True, coupling=coupling)
+    with pytest.raises(uem.ConvergenceError, match=ADVICE) as caught:
+        run(problem)
+    assert "finer facets" not in str(caught.value)

@@ -1,0 +1,93 @@
+"""Warnings of rigid contactors that are finer than their deformable target, and advice where their equations depend on each other.
+
+A rigid body has three motions in 2D and six in 3D. If its contactors outnumber these and the target's nodes opposite, their equations
+depend on each other, the distribution of forces among them is not unique, and the active set may cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from uem_dolfinx.arrays import Bools
+from uem_dolfinx.contact.both_sides import OfBothSides
+from uem_dolfinx.errors import ConvergenceError, UEMError
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import facets_of
+from uem_dolfinx.geometry.surfaces import surface_nodes
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+
+#: Sides of facets whose mean lengths differ by less than this part are equally long.
+#: [convention; length of a side; test_rigid_sides.py::test_equal_facets]
+EQUALLY_LONG = 1e-3
+
+
+class RigidSides:
+    """Nodes of a problem that couplings make rigid, and the contacts that have them as contactors (collective).
+
+    Args:
+        contacts: of the problem, each with ``contactor``, ``target``, ``name`` and ``pair``.
+        couplings: of the problem.
+    """
+
+    def __init__(self, contacts: Sequence[Any], couplings: Sequence[RigidCoupling]):
+        self._contacts: list[OfBothSides] = list(contacts) if couplings else []
+        if not self._contacts:
+            return
+        self._rigid: Bools = np.zeros(self._contacts[0].config.n_owned, dtype=bool)
+        for coupling in couplings:
+            coupling.mark(self._contacts[0].config, self._rigid)
+        for contact in contacts:
+            self._warn(contact.config, contact)
+
+    def _warn(self, config: Configuration, contact: Any) -> None:
+        """Warn of a rigid contactor with shorter facets than a deformable target (collective)."""
+        meshed = isinstance(contact.target, Tag) and isinstance(contact.contactor, Tag) and contact.contactor.dim > 0
+        if (
+            not meshed
+            or contact.tied is True
+            or not self._whole(config, contact.contactor)
+            or self._whole(config, contact.target)
+        ):
+            return
+        own, theirs = (_side(config, tag) for tag in (contact.contactor, contact.target))
+        if own < (1.0 - EQUALLY_LONG) * theirs:
+            logger.warning(
+                "%s: the contactor is rigid and finer than its target (facets of %.3g on %.3g), so that equations of contactors depend on "
+                "each other and the active set may cycle: make the rigid surface the target and the deformable one the contactor",
+                contact.name, own, theirs,
+            )  # fmt: skip
+
+    def _whole(self, config: Configuration, tag: Tag) -> bool:
+        """Whether all nodes of a surface are rigid (collective)."""
+        return not reduced(config.comm, int((~self._rigid[surface_nodes(config, tag)]).sum()))
+
+    def advise(self, error: UEMError) -> None:
+        """Add advice to a ConvergenceError if equations of rigid contactors depend on others in the present state (collective)."""
+        if not isinstance(error, ConvergenceError):
+            return
+        for contact in self._contacts:
+            pair = contact.pair
+            if reduced(pair.config.comm, int((pair.trial.active & pair.redundant & self._rigid[pair.nodes]).sum())):
+                error.amend(
+                    f"{contact.name}: equations of contactors on a rigid body depend on each other: make the rigid surface the target, "
+                    "in general contact by order=[...] with the deformable body first",
+                    instead=True,
+                )
+                return
+
+
+def _side(config: Configuration, tag: Tag) -> float:
+    """Mean length of the sides of a surface's facets (collective)."""
+    facets = facets_of(config, tag)
+    x, ends = config.X[facets.dofs], np.array(facets.shape.topology[1])
+    sides = np.linalg.norm(x[:, ends[:, 1]] - x[:, ends[:, 0]], axis=2)
+    total, number = reduced(config.comm, np.array([sides.sum(), sides.size]))
+    return float(total / max(number, 1.0))
