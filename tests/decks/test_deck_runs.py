@@ -81,6 +81,27 @@ def test_steps_that_go_on(folder):
     assert abs(deck.displacement(121)[2]) < 1e-12 and deck.displacement(221)[2] == pytest.approx(-100.0 / E, rel=1e-9)
 
 
+SLIDES = [([0.2, 0.2, 0.1], 0.2, {3: 0.1}), ([0.0, 0.3, 0.3], 0.0, {2: 0.3}), ([0.4, 0.4, 0.0], 0.4, {3: 0.0})]
+
+
+@pytest.mark.parametrize(("expected", "mu", "changes"), SLIDES)
+@pytest.mark.parametrize("how", ["SURFACE TO SURFACE", "NODE TO SURFACE"])
+@pytest.mark.parametrize("soft", [False, True])
+def test_friction_that_steps_change(folder, expected, mu, changes, how, soft):
+    """A column that is pressed and led to and fro pulls with the coefficient of its step, as friction2 of CalculiX does."""
+    p, held = 100.0, "foot 1, 1, 3\nhead 1, 1, 3\nfoot 2, 2, 2\n"
+    law = "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR\n1e7, 1.\n" + (f"*FRICTION\n{mu}, 80.\n" if mu else "")
+    steps = f"*STEP\n*STATIC\n0.5, 1.\n*DLOAD\n21, P2, {p}\n*BOUNDARY\nhead 2, 1, 2\n*END STEP\n"
+    for k, way in enumerate((0.1, -0.1, 0.1), 1):
+        change = f"*CHANGE FRICTION, INTERACTION=I\n*FRICTION\n{changes[k]}, 80.\n" if k in changes else ""
+        steps += f"*STEP\n*STATIC\n0.5, 1.\n{change}*BOUNDARY\nhead 2, 1, 1, {way}\n*END STEP\n"
+    deck = uem.read_deck(written(folder, two(how=how, law=law, step=steps, held=held)), COMM, soft=soft)
+    pulled = {step.step: deck.contacts["under 2 on over 1"].resultant().force for step in deck.run()}
+    assert not any("FRICTION" in one for one in deck.left_out)
+    assert [abs(pulled[f"step {k}"][0]) / p for k in (2, 3, 4)] == pytest.approx(expected, abs=1e-6)
+    assert pulled["step 4"][2] == pytest.approx(p, rel=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["C3D8", "CPE4", "CPS4", "CAX4"])
 @pytest.mark.parametrize("nlgeom", ["", ", NLGEOM"])
 def test_free_expansion(folder, kind, nlgeom):
@@ -205,6 +226,10 @@ def test_what_is_refused(folder):
     law = "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=PERMANENT\n1., 1.\n"
     path = written(folder, two(law=law, step=static))
     refused(uem.InputError, ("PERMANENT", "LINEAR"), lambda: uem.read_deck(path, COMM, soft=True))
+    change, rub = "*CHANGE FRICTION, INTERACTION={}\n", "*FRICTION\n0.1\n"
+    refused(uem.InputError, ("FRICTION", "CHANGE FRICTION"), read(two(step=f"*STEP\n*STATIC\n{rub}*END STEP\n")))
+    other = f"*STEP\n*STATIC\n{change.format('J')}{rub}*END STEP\n"
+    refused(uem.InputError, ("no interaction 'J'", "one of I"), read(two(step=other)))
     deck = ran(folder, two(step="*STEP\n*STATIC\n*DLOAD\n21, P2, 1.\n*END STEP\n"))
     refused(uem.InputError, ("node = 7", "no body"), lambda: deck.displacement(7))
     refused(uem.InputError, "no unknown temperatures", lambda: deck.temperature(101))

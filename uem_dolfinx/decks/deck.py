@@ -155,17 +155,33 @@ class Deck(given.Sealed):
         for pair, contact in zip(self._model.pairs, self.contacts.values()):
             if (key := (pair.slave.upper(), pair.master.upper())) in step.contacts:
                 changed[contact] = step.contacts[key]
+        friction = self._friction_of(k, step)
         if step.kind == "STATIC" or step.steady:
             n = int(np.ceil(step.duration / step.first - SAME_LENGTH))
-            yield OfUsers(f"step {k + 1}", n, bcs=bcs, contacts=changed, loads=self._loads(k, 0.0), begin=self._pass(np.inf))
+            begin = self._pass(np.inf)
+            yield OfUsers(
+                f"step {k + 1}", n, bcs=bcs, contacts=changed, friction=friction, loads=self._loads(k, 0.0), begin=begin
+            )
             return
         time, dt = 0.0, step.first
         while time < step.duration:
             dt = step.first if step.direct else min(dt, step.duration / LEAST_STEPS)
             end = time + dt if time + (1.0 + SAME_LENGTH) * dt < step.duration else step.duration
             # conditions of heat act in full from the beginning
-            yield OfUsers(f"step {k + 1}", bcs=bcs, contacts=changed, loads=self._loads(k, 1.0), begin=self._pass(end - time))
-            time, dt, changed = end, dt * LONGER, {}
+            begin = self._pass(end - time)
+            yield OfUsers(f"step {k + 1}", bcs=bcs, contacts=changed, friction=friction, loads=self._loads(k, 1.0), begin=begin)
+            time, dt, changed, friction = end, dt * LONGER, {}, {}
+
+    def _friction_of(self, k: int, step: Step) -> dict[Contact, Any]:
+        """Coefficients of friction that a step changes; at first, of contacts that have friction in later steps only, 0."""
+        found: dict[Contact, Any] = {}
+        for pair, contact in zip(self._model.pairs, self.contacts.values()):
+            if pair.interaction in step.friction:
+                found[contact] = step.friction[pair.interaction]
+            elif k == 0 and not pair.tied and not self._interaction(pair).friction and contact.friction:
+                # functions of position and load factor are not ramped
+                found[contact] = lambda x, s: np.zeros(x.shape[1])
+        return found
 
     def _pass(self, dt: float) -> Callable[[], None]:
         """What begins a step of time."""
@@ -237,19 +253,25 @@ class Deck(given.Sealed):
         direction = axis[:g] if any(axis[:g]) else None
         return Preload(self._tag(name), self._tag(BACK.format(name)), direction, coupling="mortar", name=name, **led)
 
+    def _interaction(self, pair: Pair) -> Interaction:
+        return self._model.interactions.get(pair.interaction, Interaction())
+
     def _contact(self, pair: Pair) -> Contact:
-        law, name = self._model.interactions.get(pair.interaction, Interaction()), f"{pair.slave} on {pair.master}"
+        law, name = self._interaction(pair), f"{pair.slave} on {pair.master}"
         slave, master = self._tag(pair.slave), self._tag(pair.master)
         how: dict[str, Any] = {"coupling": "mortar" if pair.surfaces and slave.dim else "node_to_surface", "name": name}
         how |= {} if pair.adjust is None else {"adjust": pair.adjust or False}
         if pair.tied or law.overclosure == "TIED":
             return Contact(slave, master, tied=True, **how)
         how |= {"sliding": "small"} if pair.small else {}
-        how |= {"friction": law.friction} if law.friction else {}
-        if self._soft and law.numbers:
+        # a contact has friction from the start if it has some in any step
+        friction = law.friction or max([step.friction.get(pair.interaction, 0.0) for step in self.steps], default=0.0)
+        how |= {"friction": friction} if friction else {}
+        if self._soft and law.numbers and not friction:
             how["normal"] = _soft(law)
         elif law.overclosure != "HARD":
-            self.left_out.append(f"PRESSURE-OVERCLOSURE={law.overclosure} of '{name}': contact is hard")
+            hard = ", as friction does not go with soft contact" if self._soft and friction else ""
+            self.left_out.append(f"PRESSURE-OVERCLOSURE={law.overclosure} of '{name}': contact is hard{hard}")
         if law.conductance and self._model.thermal:
             h = law.conductance[0][0]
             how["heat"] = Conductance(lambda p, g: np.where(g <= CONDUCTS * self.problem.config.size, h, 0.0), field=1)
@@ -345,14 +367,15 @@ def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
 
     Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
     ``*BOUNDARY``, ``*CLOAD``, pressures by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``, ``*CONTACT PAIR``, ``*TIE``,
-    ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*MODEL CHANGE`` of contact pairs and ``*PRE-TENSION SECTION``, whose surface is cut; steps
-    ``*STATIC``, ``*HEAT TRANSFER`` and ``*COUPLED TEMPERATURE-DISPLACEMENT``. All else is in ``left_out`` and in the log.
+    ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of contact pairs and
+    ``*PRE-TENSION SECTION``, whose surface is cut; steps ``*STATIC``, ``*HEAT TRANSFER`` and
+    ``*COUPLED TEMPERATURE-DISPLACEMENT``. All else is in ``left_out`` and in the log.
 
     Args:
         path: of the input file.
         comm: communicator of the mesh; rank 0 reads the file.
         soft: False takes surfaces as hard, since most decks mean the slopes of ``PRESSURE-OVERCLOSURE`` as penalties; True takes these
-            laws as they stand, as ``SoftContact``.
+            laws as they stand, as ``SoftContact``, but for contacts with friction.
 
     Raises:
         InputError, InputTypeError: for an argument of another type, or a keyword that cannot be read.

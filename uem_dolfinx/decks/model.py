@@ -26,7 +26,8 @@ KNOWN_OPTIONS = {
     "SURFACE INTERACTION": "NAME", "SURFACE BEHAVIOR": "PRESSURE-OVERCLOSURE", "CONTACT PAIR": "INTERACTION TYPE ADJUST SMALL_SLIDING",
     "TIE": "NAME POSITION_TOLERANCE ADJUST", "PRE-TENSION SECTION": "SURFACE NODE", "INITIAL CONDITIONS": "TYPE",
     "STEP": "INC NLGEOM NAME", "BOUNDARY": "OP", "CLOAD": "OP", "DLOAD": "OP", "DSLOAD": "OP", "TEMPERATURE": "OP",
-    "MODEL CHANGE": "TYPE ADD REMOVE", "STATIC": "SOLVER DIRECT", "HEAT TRANSFER": "SOLVER DIRECT STEADY_STATE",
+    "MODEL CHANGE": "TYPE ADD REMOVE", "CHANGE FRICTION": "INTERACTION", "STATIC": "SOLVER DIRECT",
+    "HEAT TRANSFER": "SOLVER DIRECT STEADY_STATE",
     "COUPLED TEMPERATURE-DISPLACEMENT": "SOLVER DIRECT STEADY_STATE",
 }  # fmt: skip
 #: Values at single nodes, or sides of elements, in turn with the same of a step.
@@ -39,6 +40,7 @@ class _Reader:
     def __init__(self, deck: Deck):
         self.model, self._deck = Model(types=deck.types), deck
         self._material, self._interaction, self._begin = Material(), Interaction(), Step()
+        self._changed = ""  # the interaction whose friction a step changes
         self._step, self._dim = self._begin, 3 if any(name.startswith("C3D") for name in deck.types) else 2
         #: Kinds of conditions of this step, and what they have set.
         self._met, self._own = set[str](), set[tuple[str, Any, Any]]()
@@ -51,7 +53,7 @@ class _Reader:
             "GAP CONDUCTANCE": self._conductance, "CONTACT PAIR": self._pair, "TIE": self._tie, "EQUATION": self._equation,
             "PRE-TENSION SECTION": self._pretension, "INITIAL CONDITIONS": self._initial, "STEP": self._new_step,
             "BOUNDARY": self._boundary, "CLOAD": self._cload, "DLOAD": self._dload, "DSLOAD": self._dload,
-            "TEMPERATURE": self._temperature, "MODEL CHANGE": self._change,
+            "TEMPERATURE": self._temperature, "MODEL CHANGE": self._change, "CHANGE FRICTION": self._change_friction,
         }  # fmt: skip
 
     def take(self, keyword: str, options: dict[str, str], rows: list[list[str]]) -> bool:
@@ -101,7 +103,18 @@ class _Reader:
         self._interaction.numbers = [_numbers(row) for row in rows]
 
     def _friction(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        self._interaction.friction = _numbers(rows[0])[0]
+        mu = _numbers(rows[0])[0]
+        if self._step is self._begin:
+            self._interaction.friction = mu
+        elif not self._changed:
+            raise InputError("it is in a step: expected *CHANGE FRICTION before it, with the INTERACTION that it changes")
+        else:
+            self._step.friction[self._changed] = mu
+
+    def _change_friction(self, options: dict[str, str], rows: list[list[str]]) -> None:
+        self._changed = options["INTERACTION"].upper()
+        if self._changed not in self.model.interactions:
+            raise InputError(f"there is no interaction '{self._changed}': expected one of {', '.join(self.model.interactions)}")
 
     def _conductance(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         self._interaction.conductance = [_numbers(row) for row in rows]
@@ -152,7 +165,7 @@ class _Reader:
 
     def _new_step(self, options: dict[str, str], rows: list[list[str]]) -> None:
         last = self.model.steps[-1] if self.model.steps else self._begin
-        self._met, self._own = set(), set()
+        self._met, self._own, self._changed = set(), set(), ""
         self._step = Step(
             nlgeom="NLGEOM" in options and options["NLGEOM"].upper() != "NO", held=dict(last.held), forces=dict(last.forces),
             pressures=dict(last.pressures), temperatures=dict(last.temperatures),

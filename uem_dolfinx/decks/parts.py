@@ -51,7 +51,11 @@ class Pair:
 
 @dataclass
 class Step:
-    """A step: its kind, times, and all conditions and loads that act in it, with their values at its end."""
+    """A step: its kind, times, and all conditions and loads that act in it, with their values at its end.
+
+    Attributes:
+        friction: coefficients that change, by the names of interactions.
+    """
 
     kind: str = "STATIC"
     nlgeom: bool = False
@@ -64,6 +68,7 @@ class Step:
     pressures: dict[Where, float] = field(default_factory=dict)
     temperatures: dict[str, float] = field(default_factory=dict)
     contacts: dict[tuple[str, str], bool] = field(default_factory=dict)
+    friction: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
