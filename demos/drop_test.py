@@ -137,7 +137,7 @@ if args.plot and common.draws_3d():
             times = [1e3 * row.time for row in book.rows]
             for name in ("kinetic", "stored", "dissipated", "friction"):
                 right.plot(times, [getattr(row, name) / first.kinetic for row in book.rows], label=name)
-            right.set(xlabel="time / ms", ylabel="energy / energy of the fall")
+            right.set(xlabel="time / ms", ylabel="energy / kinetic energy at impact")
             right.legend(frameon=False)
             for axes in (middle, right):
                 axes.grid(alpha=0.25)

@@ -165,7 +165,7 @@ if args.plot:
         if panels[1] is not None:
             panels[1].plot(time, carried, lw=0.8)
             panels[1].axhline(1.0, color="0.3", lw=1)
-            panels[1].set(xlabel="time", ylabel="force of floor and walls, upwards / weight")
+            panels[1].set(xlabel="time", ylabel="vertical force of floor and walls / weight")
             panels[1].grid(alpha=0.25)
 
 # %%

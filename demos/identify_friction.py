@@ -125,9 +125,9 @@ if args.plot:
         if panels[1] is not None:
             panels[1].plot(way, measured, "k-", lw=1, label="true parameters")
             panels[1].plot(way, noisy, "o", label="measured, with noise")
-            panels[1].plot(way, fit, "x", label="fitted to that")
-            panels[1].set(xlabel="displacement of the tail", ylabel="force", ylim=(0.0, None))
-            panels[1].legend()
+            panels[1].plot(way, fit, "x", label="fitted")
+            panels[1].set(xlabel="prescribed displacement", ylabel="force", ylim=(0.0, None))
+            panels[1].legend(frameon=False)
 if args.output:
     with uem.ResultsWriter(f"{args.output}/identify_friction", work["problem"]) as writer:
         writer.write(1.0)

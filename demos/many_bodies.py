@@ -132,14 +132,14 @@ if args.plot:
     with uem.figure(args.plot, comm, size=(5.6, 4.2)) as (ax,):
         if ax is not None:
             for what, style, label in (
-                ("step", "o-", "a step"),
-                ("step_without", "o--", "a step without contact"),
+                ("step", "o-", "step"),
+                ("step_without", "o--", "step without contact"),
                 ("set_up", "s-", "set-up"),
                 ("set_up_without", "s--", "set-up without contact"),
             ):
                 ax.loglog(number, [row[what] for row in rows], style, label=label, lw=1)
             ax.loglog(number, rows[-1]["step"] * number / number[-1], "0.6", lw=0.8, ls=":", label="slope 1")
-            ax.set(xlabel="bodies", ylabel="seconds of the processor")
+            ax.set(xlabel="bodies", ylabel="processor time / s")
             ax.legend(frameon=False)
             ax.grid(alpha=0.25)
 

@@ -135,12 +135,12 @@ if args.plot:
         if panels[0] is not None:
             panels[0].plot(knots, before / args.pressure, "o-", label="flat punch")
             panels[0].plot(knots, after / args.pressure, "x-", label="shape found")
-            panels[0].set(xlabel="x / a", ylabel="p / p0", ylim=(0.0, 3.0))
-            panels[0].legend()
+            panels[0].set(xlabel="x / a", ylabel="pressure / mean pressure p0", ylim=(0.0, 3.0))
+            panels[0].legend(frameon=False)
             panels[1].plot(knots, closed / size, "k-", lw=1, label="closed form")
             panels[1].plot(knots, shape / size, "x", label="shape found")
-            panels[1].set(xlabel="x / a", ylabel="height, in p0 a / E")
-            panels[1].legend()
+            panels[1].set(xlabel="x / a", ylabel="height of the punch / (p0 a / E)")
+            panels[1].legend(frameon=False)
 if args.output:
     film = uem.animate(
         f"{args.output}/punch_shape.gif", state["problem"], (press(y * size) for y in steps), label="vertical pressure / p0",

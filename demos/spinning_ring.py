@@ -134,9 +134,9 @@ if args.plot:
             left.set_aspect("equal")
             left.axis("off")
             mus, ratios = np.array([(row["mu"], row["impulse ratio"]) for row in rows]).T
-            right.plot([0.0, 1.0], [0.0, 1.0], color="0.3", lw=1, label="mu: it slips all the while")
+            right.plot([0.0, 1.0], [0.0, 1.0], color="0.3", lw=1, label="slip throughout: mu")
             right.plot(mus, ratios, "o", label="rings")
-            right.set(xlabel="mu", ylabel="impulse along the wall / normal to it")
+            right.set(xlabel="coefficient of friction mu", ylabel="tangential / normal impulse")
             right.grid(alpha=0.25)
             right.legend(frameon=False)
 

@@ -115,13 +115,13 @@ how["levels"] = np.linspace(0.0, 1.0, 6)
 if args.output:
     steps = uem.animate(f"{args.output}/topology.gif", problem, steps, every=2, size=(7.2, 2.4), **how)
 *_, (x, lying) = steps
-with uem.figure(args.plot, comm, panels=2, size=(5.0, 2.2)) as panels:
+with uem.figure(args.plot, comm, panels=2, size=(5.0, 3.0)) as panels:
     uem.plot_scene(problem, panels[1], **how)
     released = load(problem, x_held)
     uem.plot_scene(problem, panels[0], **how)
     if panels[0]:
-        panels[0].set_title(f"made on rollers: compliance {1 / released:.1f}")
-        panels[1].set_title(f"made on planes: compliance {1 / lying:.1f}")
+        panels[0].set_title(f"optimised on rollers: compliance {1 / released:.1f}")
+        panels[1].set_title(f"optimised on planes: compliance {1 / lying:.1f}")
 
 # %%
 results = {
