@@ -12,9 +12,11 @@ import pytest
 import ufl
 from dolfinx import fem
 from helpers import at, blocks, box, clamp, highest, linear, refused, scene, slow, st_venant
+from ramp_scenes import cracking
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.contact.pair.cohesive import growth_of
 from uem_dolfinx.solve.bodies.tangent import contact_curvature
 
 COMM = MPI.COMM_WORLD
@@ -360,6 +362,40 @@ def test_flexure_that_snaps_back():
     peak = int(d.argmax())
     assert peak < 11 and (np.diff(forces[peak:]) < 0.0).all() and (np.diff(d[peak:]) < 0.0).all()
     assert np.abs(rates[peak + 1 :] - 1.0).max() < 0.01 and iterations.max() < 10
+
+
+@pytest.mark.parametrize(("n", "energy"), [(5, 0.01), (8, 0.004), (10, 0.006)])
+@pytest.mark.parametrize(
+    ("cell", "coupling"), [("quadrilateral", "node_to_surface"), ("triangle", "mortar"), ("quadrilateral", "mortar")]
+)
+def test_path_beyond_the_last_bond(cell, coupling, n, energy):
+    """The crack has the energy of its area; when it has run through, the load rises along the elastic path of the parted bodies."""
+    r = cracking(COMM, cell=cell, coupling=coupling)
+    (bond,), u, spent, rows = r.problem.contacts, r.problem.u, 0.0, [(0.0, 0.0, 0.0)]
+    (P,) = r.problem.load
+    x = ufl.SpatialCoordinate(r.scene.mesh)
+    along = fem.form((1.5 - x[0]) * u[1] * uem.ds(r.scene.tag("top", 1, at(1, 1.0)), r.scene.mesh))
+    for step in uem.load_steps(r.problem, n, arc_length=uem.Dissipation(energy)):
+        way = COMM.allreduce(fem.assemble_scalar(along))
+        last, before, _ = rows[-1]
+        spent += 0.5 * (last * way - float(P.value) * before)
+        owned = bond.damage.function_space.dofmap.index_map.size_local
+        rows.append((float(P.value), way, COMM.allreduce(bond.damage.x.array[:owned].sum()) / 5))
+    forces, _, damage = np.array(rows).T
+    through = int(np.argmax(damage >= 1.0 - 1e-12))
+    assert 0 < through < len(rows) - 1 and (np.diff(forces[through:]) > 0.0).all() and (np.diff(forces[:through]) < 0.0).any()
+    assert spent == pytest.approx(0.05, rel=0.15)
+    assert highest(COMM, u.x.array) == pytest.approx(1.5 * 3.0 / 5.0, rel=1e-8) and step.factor == 1.0
+
+
+def test_what_can_grow_on():
+    """Damage that has grown and is not 1; damage that rests, and separated bonds, do not count."""
+    rest, whole = np.zeros(2), np.ones(2)
+    states = {(False, False): (0.5, 0.0), (True, True): (0.5, 1.0), (True, False): (1.0, 1.0)}
+    for expected, (damage, grew) in states.items():
+        state = np.column_stack([damage * whole, damage * whole, rest, grew * whole])
+        assert growth_of(state) == expected
+    assert growth_of(np.zeros((0, 4))) == (False, False)
 
 
 def test_dissipation_refuses_other_laws():

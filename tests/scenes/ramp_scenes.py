@@ -29,12 +29,13 @@ class Ramps:
     scene: Scene
     problem: uem.UnitedProblem
     calls: list[tuple[Callable[[], Any], int]] = field(default_factory=list)
+    how: dict[str, Any] = field(default_factory=dict)
 
     def steps(self, checkpoint: uem.Checkpoint | None = None) -> Iterator[uem.LoadStep]:
         """All calls one after the other, as a script makes them."""
         for prepare, n in self.calls:
             prepare()
-            yield from uem.load_steps(self.problem, n, checkpoint=checkpoint)
+            yield from uem.load_steps(self.problem, n, checkpoint=checkpoint, **self.how)
 
     def run(self, folder: Path, *, every: int = 10**6, stop: int | None = None, cell: bool = False) -> list[uem.LoadStep]:
         """Step with the checkpoint ``run`` and results ``out`` in a folder, and leave after some steps; returns those made."""
@@ -134,7 +135,25 @@ def loaded(comm: MPI.Comm) -> Ramps:
     return Ramps(b.scene, problem, [(nothing, 5)])
 
 
-RAMPS = {"sliding": sliding, "ramped": ramped, "plastic": plastic, "forming": forming, "rolling": rolling, "loaded": loaded}
+def cracking(comm: MPI.Comm, *, cell: str = "quadrilateral", pull: float = 3.0, springs: float = 5.0, **how: Any) -> Ramps:
+    """A bond that is pulled off from one end, and snaps back; springs then hold the upper body, at ``1.5 pull / springs`` where x = 0."""
+    b = blocks(comm, cell, 2, 4)
+    P, v, x = fem.Constant(b.scene.mesh, 0.0), ufl.TestFunction(b.V), ufl.SpatialCoordinate(b.scene.mesh)
+    F = linear(b.u, 10.0) + (springs * ufl.inner(b.u, v) - P * (1.5 - x[0]) * v[1]) * uem.ds(b.top, b.scene.mesh)
+    bond = uem.Contact(b.high, b.low, cohesion=uem.Cohesive(1.0, 0.05), sliding="small", **how)
+    problem = uem.UnitedProblem(F, b.u, bcs=clamp(b.V, b.bottom), contacts=[bond], load={P: pull}, rtol=1e-10)
+    return Ramps(b.scene, problem, [(nothing, 5)], {"arc_length": uem.Dissipation(0.01)})
+
+
+RAMPS = {
+    "sliding": sliding,
+    "ramped": ramped,
+    "plastic": plastic,
+    "forming": forming,
+    "rolling": rolling,
+    "loaded": loaded,
+    "cracking": cracking,
+}
 
 
 def five_steps(in_time: bool, load: Callable[[float], Any]) -> tuple[uem.UnitedProblem, Callable[[Any], Iterator[Any]]]:

@@ -73,7 +73,7 @@ def test_a_failed_solve_before_load_steps_leaves_nothing(name):
                 with pytest.raises(uem.ConvergenceError):
                     problem.solve()
                 problem.max_iterations = most
-            steps += [(s.factor, s.newton_iterations, s.cuts) for s in uem.load_steps(problem, n)]
+            steps += [(s.factor, s.newton_iterations, s.cuts) for s in uem.load_steps(problem, n, **scene.how)]
         ends.append((steps, np.array(problem.u.x.array)))
     assert ends[0][0] == ends[1][0]
     alike(ends[1][1], ends[0][1])

@@ -69,6 +69,17 @@ class SofteningInterface(Interface):
     def _make_convex(self) -> None:
         """Leave softening out of this linearised problem."""
 
+    @property
+    def growth(self) -> tuple[bool, bool]:
+        """Whether damage has grown in the last step, and whether some of it can grow on, at this rank's contactors."""
+        return False, False
+
+
+def growth_of(state: Array) -> tuple[bool, bool]:
+    """Whether damage has grown in the last step, and whether at bonds that have not separated; ``state (n, columns)`` of the bonds."""
+    grew = state[:, GREW] > 0.0
+    return bool(grew.any()), bool((grew & (state[:, DAMAGE] < 1.0)).any())
+
 
 class CohesiveInterface(SofteningInterface):
     """Contactors with bonds, made by ``unite``; other arguments as for ``Interface``.
@@ -143,6 +154,12 @@ class CohesiveInterface(SofteningInterface):
 
     def _make_convex(self) -> None:
         self._tangent = self._secant
+
+    @property
+    def growth(self) -> tuple[bool, bool]:
+        """See ``SofteningInterface``."""
+        state = self.committed.cohesion
+        return (False, False) if state is None else growth_of(state)
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """Terms of friction, and the stiffness of the bonds; see ``Interface``."""

@@ -164,6 +164,8 @@ class ArcLength:
 class AlongArc:
     """Advances a problem by steps of given arc length; the first step, of given load, determines the length.
 
+    The step after all damage that grew has separated has a given load as well, as the way that led there may have gone back.
+
     Args:
         problem: the problem.
         by: energy to dissipate in a step; None for the arc length alone.
@@ -198,35 +200,44 @@ class AlongArc:
             The load factor and the history of the Newton loop.
         """
         problem, progress = self._problem, self._problem.progress
-        number = progress.control.number
-        before, self.tried = np.array(problem.committed), progress.control.length
+        before, self.tried, dissipating = np.array(problem.committed), progress.control.length, 0.0
+        bonds = [pair for pair in problem.interfaces if isinstance(pair, SofteningInterface)]
+        way = self._way(before - progress.start)
+        size = self._size(way)
         if problem.verbose:
-            say(f"load step {number + 1}, along the arc from load factor {done:.6g}")
-        if number == 0:
-            factor, iterations = self.tried, self._by_load(self.tried)
+            say(f"load step {progress.control.number + 1}, along the arc from load factor {done:.6g}")
+        if size == 0.0:
+            # without a direction the load is given
+            factor = min(1.0, done + self.tried)
+            iterations = self._by_load(factor)
         else:
-            way = self._way(before - progress.start)
             energy = np.inf if self._by is None else self._by.energy * self.tried / progress.control.nominal
-            self._arc.begin(done, (1.0 - progress.dissipating) * way / self._size(way), progress.reach * self.tried, energy)
+            self._arc.begin(done, (1.0 - progress.dissipating) * way / size, progress.reach * self.tried, energy)
             with ExitStack() as path:
-                for pair in problem.interfaces:
-                    if isinstance(pair, SofteningInterface):
-                        path.enter_context(pair.along_path())
+                for pair in bonds:
+                    path.enter_context(pair.along_path())
                 iterations = problem.attempt(along=self._arc)
             factor = self._arc.factor
             spent = self._arc.dissipated(self._way(np.array(problem.u.x.array) - before), factor - done)
-            progress.dissipating = float(np.clip(spent / energy, 0.0, 1.0))
+            dissipating = float(np.clip(spent / energy, 0.0, 1.0))
             _check_values(problem)
             if factor > 1.0:
                 # the last step has a given load, which is near
                 factor = 1.0
                 iterations = iterations[:-1] + self._by_load(factor)
         problem.commit()
-        if number == 0:
+        progress.start = before
+        if progress.reach == 0.0:
             progress.reach = self._size(self._way(problem.committed - before)) / self.tried
             if progress.reach == 0.0:
                 raise InputError("arc_length needs a load that moves the bodies: expected a load that F depends on")
-        progress.start = before
+        if dissipating > 0.0:
+            grew, grows_on = np.any(problem.comm.allgather([pair.growth for pair in bonds] or [(False, False)]), axis=(0, 1))
+            # what has separated dissipates no more, and the step in which it did may have gone back
+            dissipating = dissipating if grows_on else 0.0
+            if grew and not grows_on and not problem.solver.indefinite:
+                progress.start = np.array(problem.committed)
+        progress.dissipating = dissipating
         return factor, iterations
 
     def _by_load(self, factor: float) -> list[Iteration]:
