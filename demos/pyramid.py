@@ -11,10 +11,9 @@ Options:
 # %% [markdown]
 # # Pyramids of discs
 #
-# Equal discs of weight w lie in rows on a floor, one less in each row above, between two walls and without friction; the discs of a row
-# do not touch but where they are pushed together. A disc then rests on two below, at 30 degrees from the vertical. It pushes each of them
-# with what the disc above on the same side hands on and w / sqrt 3 more, so that the k-th disc from the top of a side pushes with
-# k w / sqrt 3, and
+# Equal discs of weight w lie in rows on a floor, one less in each row above, between two walls and without friction. Discs of one row
+# touch only where they are pushed together. A disc then rests on two below, at 30 degrees from the vertical. Its force on each of them
+# is the force from the disc above on the same side, plus w / sqrt 3. So the k-th disc from the top of a side pushes with k w / sqrt 3, and
 #
 # $$
 # F_{floor} = \frac{n (n + 1)}{2} w,

@@ -88,9 +88,9 @@ class UnitedProblem(given.Sealed):
 
     Raises:
         InputError, InputTypeError: for an argument of another type or out of its range, with its name and value; on all ranks.
-        SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, if F does not
-            depend on it, if a Dirichlet condition, the test function or a law with history is of another space or displacement, if
-            F contains objects of another mesh, or if a contact belongs to another problem.
+        SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, or F does not
+            depend on it; if a Dirichlet condition, the test function or a law with history is of another space or displacement;
+            if F contains objects of another mesh, or a contact belongs to another problem.
         MeshError: if the coordinates of a node are not finite, with the node.
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
         KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM meanwhile.

@@ -19,8 +19,8 @@ class Dissipation(given.Sealed):
 
         uem.load_steps(problem, 20, arc_length=uem.Dissipation(2.0))
 
-    A step has the length ``(1 - e) |du| / s + dG / energy = 1`` with the arc length s, its dissipated energy dG, and the part e of
-    ``energy`` that the step before has dissipated, at most 1. Elastic steps are so those of ``arc_length=True``.
+    A step has the length ``(1 - e) |du| / s + dG / energy = 1`` with the arc length s and its dissipated energy dG. The step before has
+    dissipated the part e of ``energy``, at most 1. Elastic steps thus equal those of ``arc_length=True``.
 
     Args:
         energy: of a step, in 2D per thickness: for a crack the critical energy release rate times the area it grows by.
