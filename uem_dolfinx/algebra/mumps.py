@@ -2,9 +2,9 @@
 
 Parameters as in its users' guide: INFOG(1) is the status of a factorisation, ICNTL(14) the workspace beyond the estimate of the analysis,
 INFOG(12) the number of negative pivots of a symmetric factorisation. ICNTL(7) and INFOG(7) are the requested and the used ordering.
-ICNTL(33) enables the determinant, RINFOG(12) is its mantissa. RINFOG(1) and INFOG(20) are the estimated operations and entries, the latter in
-millions if negative. With a Schur complement all refer to the eliminated block, and with ICNTL(26) = 0 so do solves. petsc4py has neither
-Schur complements nor separate analyses, so that PETSc's library is called directly.
+ICNTL(33) enables the determinant, RINFOG(12) is its mantissa. RINFOG(1) and INFOG(20) are the estimated operations and entries, the
+latter in millions if negative. With a Schur complement all refer to the eliminated block, and with ICNTL(26) = 0 so do solves. petsc4py
+has neither Schur complements nor separate analyses, so that PETSc's library is called directly.
 """
 
 from __future__ import annotations
