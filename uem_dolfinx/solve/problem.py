@@ -150,7 +150,7 @@ class UnitedProblem(given.Sealed):
                 others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
                 check_ties(self.config.gdim, contacts, **others)
             self.materials = checks.check_materials(materials, F, u, displacement)
-            beside = {"equations": equations, "couplings": couplings}
+            beside = {"equations": equations, "couplings": linked}
             self.dynamics = checks.check_dynamics(dynamics, contacts, beside, displacement is None and method is BodySystem)
             if J is not None:
                 check_bilinear("J", J, u.function_space)

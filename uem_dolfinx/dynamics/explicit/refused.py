@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.viscous import ViscousFriction
 from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
@@ -32,12 +34,20 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
     remedy = "leave it out, or take an implicit scheme, as uem.newmark()"
     massy = dynamics.contactors == "massy"
     for name, value in others.items():
-        if value and name == "equations" and not massy:
-            raise InputError(
-                "equations need nodes with mass to go with CentralDifferences: take Dynamics(..., contactors='massy')"
-            )
-        if value and name != "equations":
+        if value and name in ("equations", "couplings") and not massy:
+            raise InputError(f"{name} need nodes with mass to go with CentralDifferences: take Dynamics(..., contactors='massy')")
+        if value and name not in ("equations", "couplings"):
             raise InputError(f"{name} does not go with CentralDifferences: {remedy}")
+    for one in others.get("couplings", ()):
+        if getattr(one, "mass", 0.0) or np.any(getattr(one, "inertia", 0.0)):
+            raise InputError(
+                f"the mass of the RigidCoupling of '{one.name}' does not go with CentralDifferences, which lump masses at nodes: give its "
+                "part more density, or take an implicit scheme, as uem.newmark()"
+            )
+        if getattr(one, "stiffness", 0.0):
+            raise InputError(
+                f"the stiffness of a {one.name} does not go with CentralDifferences, whose critical step does not count it: {remedy}"
+            )
     if not dynamics.mass.diagonal:
         raise InputError(
             "CentralDifferences divide forces by masses: expected a lumped mass; make it by uem.lumped_mass(V, density)"

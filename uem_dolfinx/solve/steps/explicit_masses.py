@@ -100,7 +100,7 @@ class StepperWithMass(ExplicitStepper):
         a = self._accelerations()
         self.dynamics.restore()
         self.problem.keep()
-        self.dynamics.change_rates(np.array(self.dynamics.velocity.x.array[: self._n]), a)
+        self._change_rates(np.array(self.dynamics.velocity.x.array[: self._n]), a)
         self.dynamics.accelerated = True
 
     def step(self, dt: float) -> Any:
@@ -129,8 +129,14 @@ class StepperWithMass(ExplicitStepper):
         # contact takes part in the change of the velocity, and the next step starts with the velocity in its middle all the same
         taken = self._along_contact(kick) if history[-1].active or problem.linear is not None else kick
         problem.commit()
-        dynamics.change_rates(np.where(self.moving, half + taken, dynamics.velocity.x.array[:n]), a + (kick - taken) * 2.0 / dt)
+        self._change_rates(np.where(self.moving, half + taken, dynamics.velocity.x.array[:n]), a + (kick - taken) * 2.0 / dt)
         return history
+
+    def _change_rates(self, v: Array, a: Array) -> None:
+        """Set velocities and accelerations ``(n,)`` at the end of a step; parts that couplings make rigid keep momenta (collective)."""
+        self.dynamics.change_rates(v, a)
+        if self.problem.linear is not None:
+            self.problem.linear.settle(self.dynamics)
 
     def _along_contact(self, change: Array) -> Array:
         """Change of velocities ``(n,)`` by a kick and the impulses of contact and equations (collective)."""
