@@ -177,7 +177,9 @@ def direction(what: str, value: npt.ArrayLike, size: int | None = None) -> Array
 
 
 def kind(what: str, value: Any, fits: bool, expected: str, remedy: str = "") -> Any:
-    """The value if ``fits``; otherwise an InputTypeError."""
+    """The value if ``fits``; otherwise, and for a class instead of an object of it, an InputTypeError."""
+    if isinstance(value, type):
+        raise InputTypeError(sentence(what, value, expected, f"make an object of it, as {value.__name__}(...)"))
     if not fits:
         raise InputTypeError(sentence(what, value, expected, remedy))
     return value

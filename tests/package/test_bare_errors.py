@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import blocks, linear, raised
+from helpers import blocks, clamp, linear, raised
 from ramp_scenes import COMM, five_steps, nothing
 
 import uem_dolfinx as uem
@@ -31,6 +31,10 @@ def fails_on_the_last_rank(h):
     if COMM.rank == COMM.size - 1:
         raise ValueError("on this rank alone")
     return h * h
+
+
+def fails_for(problem):
+    fails_on_the_last_rank(0.0)
 
 
 def one_step():
@@ -98,13 +102,52 @@ def moved_back(motions):
     five_steps(False, nothing)[0].state().move(motions)
 
 
+def estimated(estimate):
+    list(uem.load_steps(five_steps(False, nothing)[0], 1, estimate=estimate))
+
+
+def along(arc_length):
+    list(uem.load_steps(five_steps(False, nothing)[0], 1, arc_length=arc_length))
+
+
+def touching(**how):
+    b = blocks(COMM, "triangle")
+    uem.Contact(b.high, how.pop("target", b.low), **how)
+
+
+def assembled(**how):
+    b = blocks(COMM, "triangle")
+    uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), **how)
+
+
+CLASSES = [
+    *(
+        (what, kind, lambda f, what=what, kind=kind: touching(**{what: kind}))
+        for what, kind in (
+            ("normal", uem.SoftContact), ("cohesion", uem.Cohesive), ("cohesion", uem.Adhesion), ("heat", uem.Conductance),
+            ("leak", uem.Leak), ("target", uem.RigidPlane),
+        )
+    ),
+    *(
+        (what, kind, lambda f, what=what, kind=kind: assembled(**{what: [kind]}))
+        for what, kind in (("points", uem.PointLoad), ("equations", uem.Equation), ("couplings", uem.RigidCoupling))
+    ),
+    ("arc_length", uem.Dissipation, lambda f: along(uem.Dissipation)),
+    ("estimate", uem.ErrorLimit, lambda f: estimated(uem.ErrorLimit)),
+]  # fmt: skip
 CASES = {
     "general contact's force": (uem.SurfaceError, "belongs to no problem yet", lambda f: uem.GeneralContact().resultant()),
     "general contact's bodies": (uem.SurfaceError, "belongs to no problem yet", lambda f: uem.GeneralContact().touching()),
     "coupling's reaction": (
         uem.SpaceError, "is in no problem yet", lambda f: uem.RigidCoupling(np.array([0]), (0.5, 1.0)).reaction,
     ),
-    "a law's class": (uem.InputTypeError, "make the law with its numbers", lambda f: rough(uem.Coulomb)),
+    "a law's class": (uem.InputTypeError, "as Coulomb(...)", lambda f: rough(uem.Coulomb)),
+    **{
+        f"the class {kind.__name__} as {what}": (uem.InputTypeError, rf"make an object of it, as {kind.__name__}", makes)
+        for what, kind, makes in CLASSES
+    },
+    "an estimate that fails on one rank": (uem.UserFunctionError, "estimate raised ValueError", lambda f: estimated(fails_for)),
+    "an arc length by number": (uem.InputTypeError, "arc_length = 0.1: expected True, False or a Dissipation", lambda f: along(0.1)),
     "words for friction": (uem.InputTypeError, "numbers", lambda f: rough(lambda x: ["a"] * x.shape[1])),
     "no functional": (uem.InputTypeError, "functional = None", lambda f: uem.taylor_test(None, 1.0)),
     "no halvings": (uem.InputError, "halvings = 0", lambda f: uem.taylor_test(lambda h: h * h, 0.0, halvings=0)),

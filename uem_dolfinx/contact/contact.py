@@ -150,6 +150,7 @@ class Contact(WatchedContact, given.Sealed):
             rigid = hasattr(target, "project")
             swap = "a rigid surface can only be the target: swap the two"
             given.kind("contactor", contactor, not hasattr(contactor, "project"), "a part of a mesh", swap)
+            given.kind("target", target, True, "a part of a mesh, or a rigid surface")
             if not callable(coupling):
                 coupling = given.word("coupling", coupling, COUPLINGS)
             sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))

@@ -109,9 +109,7 @@ class Cohesive(given.Sealed):
         if mixed is None and (hard, tough) != (s, G):
             raise InputError("mixed = None with other values in shear: expected BenzeggaghKenane(eta) or Power(a)")
         if mixed is not None:
-            given.kind(
-                "mixed", mixed, hasattr(mixed, "between") and not isinstance(mixed, type), "BenzeggaghKenane(eta) or Power(a)"
-            )
+            given.kind("mixed", mixed, hasattr(mixed, "between"), "BenzeggaghKenane(eta) or Power(a)")
         self.strength, self.energy, self.shear_strength, self.shear_energy, self.mixed = s, G, hard, tough, mixed
         self.law, self.unloading = (
             given.word("law", law, tuple(SOFTENINGS)),

@@ -88,9 +88,7 @@ def of_rate(law: FrictionLaw) -> bool:
 def as_law(friction: Any) -> FrictionLaw:
     """The friction law of user input: Coulomb's law for a number or a function; refuse other types."""
     if hasattr(friction, "limit"):
-        given.kind(
-            "friction", friction, not isinstance(friction, type), "a number, a function or a law", "make the law with its numbers"
-        )
+        given.kind("friction", friction, True, "a number, a function or a law")
         return cast(FrictionLaw, friction)
     return Coulomb(friction if callable(friction) else given.number("friction", friction, given.NOT_NEGATIVE))
 

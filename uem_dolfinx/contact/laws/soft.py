@@ -82,7 +82,7 @@ class SoftContact(given.Sealed):
         if slope is not None:
             given.kind("slope", slope, callable(slope) and callable(p), "a function of gaps, for a function p", "leave it out")
         if hasattr(p, "pressure"):
-            self.law: PressureLaw = given.kind("p", p, not isinstance(p, type), "a law", "make the law with its numbers")
+            self.law: PressureLaw = given.kind("p", p, True, "a law")
         elif callable(p):
             self.law = _OfFunction(p, slope)
         elif isinstance(p, Sequence | np.ndarray) and not isinstance(p, str):

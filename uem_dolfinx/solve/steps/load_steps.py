@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from uem_dolfinx import given
 from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
-from uem_dolfinx.parallel import agreed
+from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.memory import take_back
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -68,7 +68,8 @@ def load_steps(
     several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
     with agreed(problem.comm):
         by = arc_length if isinstance(arc_length, Dissipation) else None
-        arc_length = True if by else given.flag("arc_length", arc_length)
+        given.kind("arc_length", arc_length, by is not None or isinstance(arc_length, bool), "True, False or a Dissipation")
+        arc_length = bool(arc_length)
         if several and arc_length:
             raise InputError(
                 "arc_length = True does not go with a list of Step: follow a path by load_steps(problem, n, arc_length=True)"
@@ -109,7 +110,7 @@ def _estimated(
 ) -> Iterator[LoadStep]:
     """The steps, after each of which the error is estimated."""
     for step in steps:
-        estimate(problem)
+        ask_together(problem.comm, "estimate", estimate, problem)
         yield step
 
 
