@@ -147,10 +147,9 @@ class Contact(WatchedContact, given.Sealed):
         name: str | None = None,
     ):
         with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
-            rigid = hasattr(target, "project")
+            rigid = hasattr(given.kind("target", target, True, "a part of a mesh, or a rigid surface"), "project")
             swap = "a rigid surface can only be the target: swap the two"
             given.kind("contactor", contactor, not hasattr(contactor, "project"), "a part of a mesh", swap)
-            given.kind("target", target, True, "a part of a mesh, or a rigid surface")
             if not callable(coupling):
                 coupling = given.word("coupling", coupling, COUPLINGS)
             sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))

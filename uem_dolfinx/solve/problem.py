@@ -163,8 +163,7 @@ class UnitedProblem(given.Sealed):
             )  # fmt: skip
             self.rtol, self.max_iterations = loop.rtol, loop.max_iterations
             self.line_search, self.verbose = loop.line_search, loop.verbose
-            if not callable(method):
-                given.kind("method", method, False, "what makes a united system of bodies and contacts, as BodySystem")
+            given.kind("method", callable(method) or method, callable(method), "what makes a united system, as BodySystem")
             if method is not BodySystem and any(contact.heats or contact.normal for contact in contacts):
                 raise InputError("heat and soft contact need the default method: leave method out, or heat and normal")
         given.alike(
