@@ -5,6 +5,8 @@ The test to read first: ``test_arrays_find_what_exchanges_find``.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from driven_scenes import MORTAR, QUICK, SCENES, WAY
@@ -14,10 +16,12 @@ from ramp_scenes import COMM
 
 from uem_dolfinx.algebra.options import has_mumps
 from uem_dolfinx.contact.seam.active_set import Violations
+from uem_dolfinx.solve.bodies.tangent import together
 from uem_dolfinx.solve.slots import settle
 from uem_dolfinx.solve.united import exchanges
-from uem_dolfinx.solve.united.exchanges import AS_LONG, AS_LONG_IF_CHEAP, Exchanges
+from uem_dolfinx.solve.united.exchanges import AS_LONG_IF_CHEAP, Exchanges
 from uem_dolfinx.solve.united.rows import Rows
+from uem_dolfinx.solve.united.system import BodySystem
 
 pytestmark = [pytest.mark.every_case, pytest.mark.skipif(not has_mumps(), reason="needs MUMPS")]
 
@@ -37,10 +41,9 @@ def led(make):
 @pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in SCENES])
 def test_arrays_find_what_exchanges_find(name, monkeypatch):
     """By every coupling and law: from the first violation on, and never; most problems then take one exchange."""
-    monkeypatch.setattr(exchanges, "AS_LONG", 10**6)
-    monkeypatch.setattr(exchanges, "AS_LONG_IF_CHEAP", 10**6)
-    by_exchanges = led(SCENES[name])
-    monkeypatch.setattr(exchanges, "AS_LONG", 0)
+    with monkeypatch.context() as never:
+        never.setattr(Exchanges, "take_long", lambda *_: False)
+        by_exchanges = led(SCENES[name])
     monkeypatch.setattr(exchanges, "AS_LONG_IF_CHEAP", 0)
     made, own = [], Rows.settle
     monkeypatch.setattr(Rows, "settle", lambda *given: made.append(own(*given)) or made[-1])
@@ -48,7 +51,31 @@ def test_arrays_find_what_exchanges_find(name, monkeypatch):
         assert one[0] == other[0] and other[1] <= max(one[1], 2)
         for a, b in zip(one[2:], other[2:]):
             assert highest(COMM, np.abs(a - b)) <= 1e-6 * highest(COMM, np.abs(a))
-    assert sum(made) >= 0.5 * len(made)
+    assert sum(one is not None for one in made) >= 0.5 * len(made)
+
+
+@pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in SCENES])
+def test_the_solution_is_that_of_the_constrained_matrix(name, monkeypatch):
+    """What is found on arrays solves ``Q'(K + G)P dq = Q'(r - K c)`` of its state, whose determinant has the same sign."""
+    own, compared = BodySystem.solve, []
+
+    def solve(system, problem, accuracy, near):
+        step, state, solver = own(system, problem, accuracy, near), problem.state, system.solver
+        if state.solved is not None and solver.tells_sign | (state.trial is state.test) and not solver.iterative:
+            told, kept = solver.negative, solver.take
+            matrix = state.trial, system.bodies.tangent.K, together(system.curvature, state.added)
+            solver.set_operator(*matrix, state.test)
+            solver.begin_at(state.trial.c)
+            dq = solver.complete(solver.solve(problem.rhs)[0])
+            compared.append((dq - step.dq).norm() / dq.norm())
+            assert solver.negative == told
+            kept(state.solved, *matrix, state.test)
+        return step
+
+    monkeypatch.setattr(BodySystem, "solve", solve)
+    monkeypatch.setattr(exchanges, "AS_LONG_IF_CHEAP", 0)
+    led(SCENES[name])
+    assert max(compared, default=0.0) <= 1e-8
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "triangle", slow("hexahedron"), slow("tetrahedron")])
@@ -61,7 +88,7 @@ def test_relative_coordinates(cell, how):
     problem, system = scene.problem, scene.problem.system
     g = problem.config.gdim
     rows = system._rows()
-    slots = settle._Slots.of(rows.pairs[0], rows.equations[0], 0)
+    slots = settle._Slots.of(rows.pairs[0], rows.equations[0], 0, np.ones(len(rows.equations[0]), dtype=bool))
     problem.bodies.update_tangent()
     condensed = settle._condensed(problem.bodies, rows.whole, rows.test, slots.rows, None)
     K, T = gathered_matrix(problem.bodies.tangent.K), gathered_matrix(condensed.trial.T.P)
@@ -98,8 +125,20 @@ def gathered_rows(config, equations, which, g):
     return np.concatenate(COMM.allgather(B[which].reshape(len(which), g * config.n_global)))
 
 
+def test_slots_are_for_contactors_within_reach():
+    """Gaps that both sides together cannot close have no slots: of two blocks, each of which goes half of the gap or less."""
+    scene = driven("quadrilateral", 0.3, law=st_venant, n=(3, 5))
+    rows, config = scene.problem.system._rows(), scene.problem.config
+    equations = replace(rows.whole.P, gap=np.full(len(rows.whole), 0.1))
+    for way, reached in ((0.0, False), (0.04, False), (0.06, True)):
+        du = np.zeros((config.n_owned, config.gdim))
+        du[:, -1] = way
+        near = settle._near(equations, rows.test.space, du)[rows.whole.normal]
+        assert (near == reached).all()
+
+
 def test_when_arrays_are_used():
-    """Once in a problem, after two factorisations or ten solves without."""
+    """Once in a problem, instead of the first factorisation for another state, or after ten solves without."""
     scene = driven(mu=0.3, law=st_venant, n=(3, 5))
     wrong = [Violations(np.ones(n := len(pair.nodes), bool), np.zeros(n, bool), np.ones(n)) for pair in scene.problem.pairs]
     none = [Violations.none(len(pair.nodes)) for pair in scene.problem.pairs]
@@ -110,4 +149,4 @@ def test_when_arrays_are_used():
             assert not own.take_long(none, cheap)
             taken += [number] * own.take_long(wrong, cheap)
             own._solve_again()
-    assert taken == [AS_LONG, AS_LONG_IF_CHEAP] and 1 < taken[0] < 4 < taken[1] < 15
+    assert taken == [0, AS_LONG_IF_CHEAP] and 4 < taken[1] < 15

@@ -16,7 +16,7 @@ the forces on I. Other increments e_C under the same forces need dense algebra o
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from petsc4py import PETSc
@@ -34,6 +34,20 @@ from uem_dolfinx.parallel import on_root, reduced
 #: A sparse factorisation takes as long, beside its arithmetic, as so many floating-point operations for each unknown.
 #: [heuristic; operations; test_condensed.py::test_which_way_is_cheaper]
 FOR_EACH_UNKNOWN = 30_000
+
+
+class Solved(NamedTuple):
+    """The solution of a constrained problem.
+
+    Attributes:
+        du: increment of the bodies.
+        negative: whether the constrained matrix has a negative determinant.
+        indefinite: whether it is symmetric, and has negative eigenvalues.
+    """
+
+    du: PETSc.Vec
+    negative: bool
+    indefinite: bool
 
 
 class Condensed:
@@ -77,6 +91,8 @@ class Condensed:
         self._negative_inside = self._indefinite_inside = False
         #: P, Q, K and G of the constrained problem, and on rank 0 its dense matrix.
         self.made_of: Any = None
+        #: Its unknowns, if they are known without it.
+        self._taken: PETSc.Vec | None = None
         self._dense: _Dense | None = None
         #: Whether the constrained matrix has a negative determinant, and, if it is symmetric, negative eigenvalues.
         self.negative = self.indefinite = False
@@ -214,11 +230,16 @@ class Condensed:
             test = trial if P is Q else self._on_root(test_rows, numbers)
             curvature = None if G is None else self._on_root(blocks_of_matrix(self.space, G), numbers)
             used = on_root(self.space.comm, P.used.ravel()[self._at].astype(float)) > 0
-            self.made_of, self._dense, self.negative = (P, Q, self._made_for[0], G), None, False
+            self.made_of, self._dense, self._taken, self.negative = (P, Q, self._made_for[0], G), None, None, False
             if self.space.comm.rank == 0:
                 self._dense = _Dense(self._St, curvature, trial[:, used], None if P is Q else test[:, used], used)
             negative, indefinite = self.space.comm.bcast(self._dense and (self._dense.negative, self._dense.indefinite))
             self.negative, self.indefinite = self._negative_inside != negative, self._indefinite_inside or indefinite
+
+    def take(self, solved: Solved, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
+        """Use a known solution of the constrained problem (collective)."""
+        self.made_of, self._dense, self._taken = (P, Q, K, G), None, P.reduce(solved.du - P.c)
+        self.negative, self.indefinite, self.whole = solved.negative, solved.indefinite, True
 
     def begin_at(self, c: PETSc.Vec | None, rounding: float = 0.0) -> None:
         """Set the increment to which the next solves add ``P dq``.
@@ -237,6 +258,8 @@ class Condensed:
             again: whether the forces on I are the same as for the known increment.
             accuracy: relative residual that is acceptable on I if it is rounding, too.
         """
+        if self._taken is not None:
+            return self._taken
         (P, Q, K, _), at = self.made_of, self._at
         c = self.space.vector(np.zeros_like(rhs.array_r)) if self._closure is None else self._closure
         self._begins = self.whole = False

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.algebra import mumps
-from uem_dolfinx.algebra.condensed import Condensed
+from uem_dolfinx.algebra.condensed import Condensed, Solved
 from uem_dolfinx.algebra.deflation import MULTIGRID, in_deflation, near_null_space, pressed_hard
 from uem_dolfinx.algebra.entries import is_symmetric, rows_are_symmetric, stiffen
 from uem_dolfinx.algebra.kept_factor import KeptFactor
@@ -184,6 +184,11 @@ class UnitedSolver:
             # its smoothers would keep eigenvalue bounds estimated by GMRES
             self._use(self.options)
         self._set_symmetric(restriction, K, G)
+
+    def take(self, solved: Solved, P: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, Q: Restriction) -> None:
+        """As ``set_operator``, for a constrained problem whose solution is known (collective)."""
+        self.condensed.take(solved, P, Q, K, G)
+        self._petrov_galerkin, self._on_condensed, self._served, self._made_of = Q is not P, True, None, None
 
     def _set_symmetric(self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
         """Set ``P'(K + G)P`` as operator of the KSP (collective)."""
@@ -367,8 +372,7 @@ class UnitedSolver:
             self._of = self._made_of = None
             self.set_operator(*self._served)
             return self.solve(rhs, accuracy, near)
-        # factorisations need no initial guess
-        guess = near if self.iterative else None
+        guess = near if self.iterative else None  # factorisations need none
         dq = rhs.duplicate() if guess is None else guess.copy()
         self.ksp.setInitialGuessNonzero(guess is not None)
         if self.inexact:

@@ -7,7 +7,8 @@ columns of T. With ``K_U = T'(K + G)T`` condensed onto the slots,
 
     force = S w + f
 
-are the multipliers of all equations, whichever contactors are open, stick or slip.
+are the multipliers of all equations, whichever contactors are open, stick or slip. Motions w give those of the bodies without another
+factorisation.
 """
 
 from __future__ import annotations
@@ -67,6 +68,8 @@ class Condensation:
 
     Attributes:
         stiffness: S on rank 0, in the order of the ranks' slots, else empty; None if MUMPS fails.
+        negative: whether the matrix without the slots has a negative determinant.
+        indefinite: whether it is symmetric, and has negative eigenvalues.
     """
 
     def __init__(self, space: Nodes, trial: RelativeCoordinates, test: RelativeCoordinates, K: PETSc.Mat, G: PETSc.Mat | None):
@@ -81,6 +84,7 @@ class Condensation:
         self.stiffness: Any
         with timed("factorisation or preconditioner set-up"):
             self.stiffness = mumps.schur_complement(self._pc, self._at + space.block * space.first)
+            self.negative, self.indefinite = mumps.is_negative(self._pc), mumps.is_indefinite(self._pc)
             if self.stiffness is not None and not mumps.solves_with_schur_complement(space.comm):
                 self.stiffness = self.stiffness if self._factorise_inside() else None
 
@@ -98,15 +102,27 @@ class Condensation:
 
     def load(self, F: PETSc.Vec) -> Any:
         """Forces in the slots without relative motion under forces F of the bodies, on rank 0; an empty array elsewhere (collective)."""
-        c, at = self.trial.T.c, self._at
-        y = self.test.T.transpose(F + forms.product(self._K, c, self._G))
-        inside, moved = y.copy(), y.duplicate()
-        inside.array[at] = 0.0
+        self._y = self.test.T.transpose(F + forms.product(self._K, self.trial.T.c, self._G))
+        left = self._y + self.A * self._moved(self._y)
+        return on_root(self.space.comm, left.array_r[self._at])
+
+    def _moved(self, y: PETSc.Vec) -> PETSc.Vec:
+        """Unknowns in equilibrium with forces ``y`` on them, zero in slots (collective)."""
+        inside, moved = -y, y.duplicate()
+        inside.array[self._at] = 0.0
         inside.array[~self.trial.T.used.ravel()] = 0.0
         self._pc.apply(inside, moved)
-        moved.array[at] = 0.0
-        left = y - self.A * moved
-        return on_root(self.space.comm, left.array_r[at])
+        moved.array[self._at] = 0.0
+        return moved
+
+    def moved(self, w: Any) -> PETSc.Vec:
+        """Increment du with relative motions w, on rank 0 ``(k,)``, under the forces of the last ``load`` (collective)."""
+        comm, slots = self.space.comm, self._y.duplicate()
+        counts = np.cumsum(comm.allgather(len(self._at)))
+        slots.array[:] = 0.0
+        slots.array[self._at] = comm.scatter(np.split(w, counts[:-1]) if comm.rank == 0 else None)
+        du = self.trial.T.expand(slots + self._moved(self._y + self.A * slots))
+        return du + self.trial.T.c
 
     def numbers(self, which: Ints) -> Ints:
         """Positions in S of the slots of some equations ``(...)``, -1 for -1 (collective)."""

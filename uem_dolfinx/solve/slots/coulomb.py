@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uem_dolfinx.algebra.entries import SYMMETRIC
 from uem_dolfinx.arrays import Array, Bools, Ints
 
 #: Conditions hold if no force violates them by more than this part of the terms of ``stiffness @ w + load``.
@@ -69,6 +70,8 @@ class SlotState:
         w: relative motions ``(k,)``.
         force: in the slots ``(k,)``.
         solves: number of dense solves.
+        negative: whether the matrix of the slots that are not held has a negative determinant.
+        indefinite: whether it is symmetric, and has negative eigenvalues.
     """
 
     active: Bools
@@ -77,11 +80,16 @@ class SlotState:
     w: Array
     force: Array
     solves: int
+    negative: bool
+    indefinite: bool
 
 
 @dataclass(frozen=True)
 class _Point:
-    """Relative motions, forces, states of the projection: ``along`` is ``y / |y|``, ``part`` is ``min(1, limit / |y|)``."""
+    """Relative motions, forces, states of the projection: ``along`` is ``y / |y|``, ``part`` is ``min(1, limit / |y|)``.
+
+    ``negative`` is the sign of the determinant in the step that has led to it.
+    """
 
     w: Array
     force: Array
@@ -90,6 +98,7 @@ class _Point:
     along: Array
     part: Array
     residual: Array
+    negative: bool = False
 
 
 class _Newton:
@@ -122,10 +131,7 @@ class _Newton:
         """Solution of the conditions linearised at a point, or None if there is none."""
         from scipy.linalg.lapack import dgesv
 
-        p, S = self.problem, self.problem.stiffness
-        w, free, stuck = np.zeros_like(p.load), np.ones(len(p.load), dtype=bool), now.stick[:, None] & self.there
-        for held, to in ((p.normal[now.closed], p.gap[now.closed]), (p.tangents[stuck], p.slip[stuck])):
-            w[held], free[held] = -to, False
+        p, S, (w, free), negative = self.problem, self.problem.stiffness, self.held(now), False
         # forces by free slots, and in the last column by held ones
         rows, place = np.column_stack([S[:, free], p.load + S[:, ~free] @ w[~free]]), np.cumsum(free) - 1
         if len(i := np.flatnonzero(now.closed & self.frictional & ~now.stick)):
@@ -140,10 +146,29 @@ class _Newton:
             rows[slots[there]] = tau[there]
         if free.any():
             self.solves += 1
-            _, _, w[free], info = dgesv(rows[free, :-1], -rows[free, -1])
+            factors, pivots, w[free], info = dgesv(rows[free, :-1], -rows[free, -1])
             if info or not np.isfinite(w).all():
                 return None
-        return self.at(w)
+            swaps = np.count_nonzero(pivots != np.arange(len(pivots)))
+            negative = bool((swaps + np.count_nonzero(np.diag(factors) < 0.0)) % 2)
+        return replace(self.at(w), negative=negative)
+
+    def held(self, now: _Point) -> tuple[Array, Bools]:
+        """Motions of held slots, zero in others, and the mask of these others ``(k,)``."""
+        p, stuck = self.problem, now.stick[:, None] & self.there
+        w, free = np.zeros_like(p.load), np.ones(len(p.load), dtype=bool)
+        for held, to in ((p.normal[now.closed], p.gap[now.closed]), (p.tangents[stuck], p.slip[stuck])):
+            w[held], free[held] = -to, False
+        return w, free
+
+    def indefinite(self, now: _Point) -> bool:
+        """Whether the stiffness of the slots that are not held is symmetric and has negative eigenvalues."""
+        from scipy.linalg.lapack import dpotrf
+
+        free = self.held(now)[1]
+        S = self.problem.stiffness[np.ix_(free, free)]
+        root = np.sqrt(np.abs(np.diag(S)))
+        return bool(len(S) and (np.abs(S - S.T) <= SYMMETRIC * root[:, None] * root).all() and dpotrf(S)[1])
 
     def rounding(self, now: _Point) -> float:
         """Violations that count as zero, a force; negative if forces are not known."""
@@ -208,4 +233,5 @@ def solve(problem: SlotProblem) -> SlotState | None:
         return None
     slips = found.closed & ~found.stick & newton.frictional
     direction = np.where(slips[:, None], -found.along, 0.0)
-    return SlotState(found.closed, found.stick, direction, found.w, found.force, newton.solves)
+    indefinite = not slips.any() and newton.indefinite(found)
+    return SlotState(found.closed, found.stick, direction, found.w, found.force, newton.solves, found.negative, indefinite)

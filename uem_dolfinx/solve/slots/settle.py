@@ -14,6 +14,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.algebra import mumps
+from uem_dolfinx.algebra.condensed import Solved
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.options import FACTORISED_UP_TO
 from uem_dolfinx.algebra.relative import Condensation, RelativeCoordinates
@@ -26,6 +27,7 @@ from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import ConflictError
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import on_root, reduced
 from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.bodies.tangent import known_forces
@@ -55,12 +57,21 @@ class _Slots:
     directions: Array
 
     @classmethod
-    def of(cls, pair: Interface, own: ContactRows, first: int) -> _Slots:
-        """Slots of contactors that may be in contact; the pair's rows begin with number ``first`` of all rows."""
+    def of(cls, pair: Interface, own: ContactRows, first: int, near: Bools) -> _Slots:
+        """Slots of contactors that may be in contact.
+
+        Args:
+            pair: with its contactors.
+            own: rows of the pair.
+            first: number of the first of them, of all rows.
+            near: rows of contactors that may close their gaps ``(m,)``.
+        """
         place = np.full((len(pair.nodes), pair.config.gdim), -1, dtype=np.int64)
         rows = np.flatnonzero((own.normal | (own.tangent >= 0)) & own.rows.direction.any(axis=1))
         place[own.contactor[rows], own.tangent[rows] + 1] = rows
-        place[~pair.trial.active & (pair.off | ~pair.movable)] = -1
+        there = place[:, 0] >= 0
+        there[there] = near[place[there, 0]]
+        place[~pair.trial.active & (pair.off | ~pair.movable | ~there)] = -1
         contactor = np.flatnonzero(place[:, 0] >= 0)
         along = place[contactor, 1:]
         there = along >= 0
@@ -118,8 +129,9 @@ def settle(
     test: Restriction,
     F: PETSc.Vec,
     G: PETSc.Mat | None,
-) -> bool:
-    """Solve a linearised problem with all conditions of contact; whether the pairs have its state (collective).
+    du: Array,
+) -> Solved | None:
+    """Solve a linearised problem with all conditions of contact; the pairs then have its state (collective).
 
     Args:
         bodies: with their tangent.
@@ -128,19 +140,26 @@ def settle(
         test: Q of the present state.
         F: forces of the bodies at the present displacement, minus friction that is independent of normal forces.
         G: curvature of the contact, or None.
+        du: increment of the present state ``(n_owned, gdim)``: contactors whose gaps are wider than both sides go stay open.
+
+    Returns:
+        The solution, or None if none has been found.
     """
     comm, space, slots, first = bodies.comm, test.space, [], 0
-    for pair, own in equations.items():
-        slots.append(_Slots.of(pair, own, first))
-        first += len(own)
     few = space.block * space.n_global <= FACTORISED_UP_TO[space.gdim] and mumps.has_schur_complements() and not space.mixed
-    described = few and test.rings is None and first == len(whole) and all(one.describable for one in slots)
+    if not few:
+        return None
+    near = _near(whole.P, space, du)
+    for pair, own in equations.items():
+        slots.append(_Slots.of(pair, own, first, near[first : first + len(own)]))
+        first += len(own)
+    described = test.rings is None and first == len(whole) and all(one.describable for one in slots)
     number, refused = reduced(comm, np.array([sum(len(one.rows) for one in slots), not described], dtype=np.int64))
     if refused or not 0 < number <= MOST_SLOTS:
-        return False
+        return None
     condensed = _condensed(bodies, whole, test, np.concatenate([one.rows for one in slots]), G)
     if condensed is None:
-        return False
+        return None
     for nodes, forces in known_forces(list(equations)):
         F.array[: bodies.forces.size] += bodies.config.add_at_owners(nodes, forces).ravel()
     load, gap = condensed.load(F), whole.P.gap
@@ -149,15 +168,28 @@ def settle(
     slip = np.where(tangents >= 0, gap[tangents], 0.0)
     arrays = [on_root(comm, a) for a in (*map(condensed.numbers, (normal, tangents)), gap[normal], slip, *limits)]
     found = coulomb.solve(coulomb.SlotProblem(condensed.stiffness, load, *arrays)) if comm.rank == 0 else None
+    told = comm.bcast(None if found is None else (_states(found, *arrays[1:4:2]), found.negative, found.indefinite))
+    solved = None
+    if told is not None:
+        moved = condensed.moved(found.w if found is not None else None)
+        solved = Solved(moved, condensed.negative != told[1], condensed.indefinite or told[2])
     condensed.destroy()
-    states = comm.bcast(None if found is None else _states(found, *arrays[1:4:2]))
-    if states is None:
-        return False
+    if told is None:
+        return None
     begins = sum(comm.allgather(len(normal))[: comm.rank])
     ends = begins + np.cumsum([len(one.contactor) for one in slots])
     for one, end in zip(slots, ends):
-        one.take(*(values[end - len(one.contactor) : end] for values in states))
-    return True
+        one.take(*(values[end - len(one.contactor) : end] for values in told[0]))
+    return solved
+
+
+def _near(equations: UnitingEquations, space: Nodes, du: Array) -> Bools:
+    """Rows whose gaps are not wider than their nodes and the nodes that these follow go in an increment ``(m,)`` (collective)."""
+    eq, way = equations, np.linalg.norm(du, axis=1)
+    asked, term = np.unique(eq.followed, return_inverse=True)
+    there = space.ask_owners(asked, way[:, None])[term, 0] * np.linalg.norm(eq.coefficients, axis=1)
+    reach = np.linalg.norm(eq.direction, axis=1) * way[eq.node] + np.bincount(eq.row, there, len(eq))
+    return np.asarray(eq.gap <= reach)
 
 
 def _condensed(bodies: Bodies, whole: ContactRows, test: Restriction, rows: Ints, G: PETSc.Mat | None) -> Condensation | None:

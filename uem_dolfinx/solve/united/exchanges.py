@@ -42,10 +42,7 @@ MOST_EXCHANGES = 100
 #: Exchanges of the first contactor alone find the active set of every convex problem without friction; they may take so many of them.
 #: [bound; exchanges for each contactor; -]
 MOST_OF_EACH = 20
-#: Condensing the bodies onto the slots of the contact takes as long as so many exchanges, each with a factorisation.
-#: [convention; exchanges; test_settle.py::test_when_arrays_are_used]
-AS_LONG = 2
-#: And as so many without factorisations.
+#: Condensing the bodies onto the slots of the contact takes as long as one factorisation, and as so many exchanges without.
 #: [convention; exchanges; test_settle.py::test_when_arrays_are_used]
 AS_LONG_IF_CHEAP = 10
 #: A state that comes again with more than this part of the residual that it had has led nowhere.
@@ -127,13 +124,13 @@ class Exchanges:
         self._changed, self._lately = self._none(), self._none()
 
     def take_long(self, violated: Sequence[Violations], cheap: bool) -> bool:
-        """Whether so many exchanges have been made that the problem is now to be solved on arrays, which counts as one (collective).
+        """Whether the problem is now to be solved on arrays, which counts as an exchange (collective).
 
         Args:
             violated: violations of every pair.
             cheap: whether an exchange needs no factorisation.
         """
-        made = self._number == (AS_LONG_IF_CHEAP if cheap else AS_LONG) and not (self.held or self._were_held or self.frozen)
+        made = self._number == (AS_LONG_IF_CHEAP if cheap else 0) and not (self.held or self._were_held or self.frozen)
         if not made or not count(self._pairs, violated):
             return False
         self._number, self._pivoting = self._number + 1, Pivoting()

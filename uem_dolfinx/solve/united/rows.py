@@ -25,7 +25,9 @@ from uem_dolfinx.solve.bodies.tangent import contact_curvature, together
 from uem_dolfinx.solve.united.newton import IterationState
 
 if TYPE_CHECKING:
+    from uem_dolfinx.algebra.condensed import Solved
     from uem_dolfinx.algebra.dependent import IndependentEquations
+    from uem_dolfinx.algebra.linear_solver import UnitedSolver
     from uem_dolfinx.conditions.user_rows import UserRows
     from uem_dolfinx.contact.thermal.heat import Heat, HeatEquations
     from uem_dolfinx.solve.bodies.bodies import Bodies
@@ -164,11 +166,11 @@ class Rows:
         """Whether some of the equations depend on others."""
         return self.independent is not None and self.independent.found
 
-    def settle(self, bodies: Bodies, F: PETSc.Vec, G: PETSc.Mat | None) -> bool:
+    def settle(self, bodies: Bodies, F: PETSc.Vec, G: PETSc.Mat | None, du: Array) -> Solved | None:
         """Solve the linearised problem on arrays, with all conditions of contact, see ``slots.settle`` (collective)."""
         from uem_dolfinx.solve.slots.settle import settle
 
-        return not self.conflict and settle(bodies, dict(zip(self.pairs, self.equations)), self.whole, self.test, F, G)
+        return None if self.conflict else settle(bodies, dict(zip(self.pairs, self.equations)), self.whole, self.test, F, G, du)
 
     def of(self, pairs: Sequence[Interface]) -> list[ContactRows]:
         """Equations of each of these pairs; empty for pairs without equations."""
@@ -180,11 +182,36 @@ class Rows:
 
 @dataclass(frozen=True)
 class BodyState(IterationState):
-    """``IterationState`` with its rows, and the terms of the slip directions in tangent (``added``) and residual (``held``)."""
+    """``IterationState`` with its rows, and the terms of the slip directions in tangent (``added``) and residual (``held``).
+
+    ``solved`` is the solution of its linearised problem, if known.
+    """
 
     rows: Rows
     added: PETSc.Mat | None
     held: PETSc.Vec | None
+    solved: Solved | None = None
+
+    def with_rows(
+        self,
+        rows: Rows,
+        solved: Solved | None,
+        trial: Restriction,
+        added: PETSc.Mat | None,
+        held: PETSc.Vec | None,
+        active: int,
+    ) -> BodyState:
+        """The same bodies with other rows; a known solution holds if no body has come loose, or was loose, by these (collective)."""
+        alike = reduced(rows.test.comm, int(np.array_equal(rows.test.free, self.test.free)), op=MPI.LAND)
+        now = replace(self, rows=rows, test=rows.test, trial=trial, added=added, held=held, active=active)
+        return replace(now, right=False, solved=solved if alike else None)
+
+    def set_operator(self, solver: UnitedSolver, K: PETSc.Mat, G: PETSc.Mat | None, roughly: bool) -> None:
+        """Set ``Q'(K + G)P``, see ``UnitedSolver.set_operator``, or the known solution (collective)."""
+        if self.solved is None:
+            solver.set_operator(self.trial, K, G, self.test, roughly)
+        else:
+            solver.take(self.solved, self.trial, K, G, self.test)
 
     def with_pressures(self, K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
         """The state with the derivatives of heat by pressures, if pressures are forces of single contactors (collective).

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
+from uem_dolfinx.algebra.condensed import Solved
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
@@ -297,8 +297,8 @@ class BodySystem:
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated[k] = pair.violated(gaps[k], forces[k], along, least, near, self._swept, moved)
             costly = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap)
-            if costly and state.rows.settle(self.bodies, self.residual(), self.curvature):
-                return self._with_rows(state)
+            if costly and (solved := state.rows.settle(self.bodies, self.residual(), self.curvature, increment)):
+                return self._with_rows(state, solved)
             if self._adrift:
                 chosen = violated if count(self.pairs, violated) else None
             else:
@@ -315,12 +315,11 @@ class BodySystem:
                 pair.exchange(w)
             return self._with_rows(state)
 
-    def _with_rows(self, state: BodyState) -> BodyState:
-        """The same bodies and residual with the rows of the pairs' present states (collective)."""
+    def _with_rows(self, state: BodyState, solved: Solved | None = None) -> BodyState:
+        """The same bodies and residual with the rows of the pairs' present states, and their solution if known (collective)."""
         rows = self._rows()
         self._adrift = self.floating.adrift  # a released body has to fall first
-        trial, added, held, active, _ = self._trial_of(rows)
-        return replace(state, trial=trial, test=rows.test, rows=rows, added=added, held=held, active=active, right=False)
+        return state.with_rows(rows, solved, *self._trial_of(rows)[:4])
 
     def _predicted_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
         """``F = K du`` plus the terms of contact and friction, and the present forces (collective)."""
@@ -408,7 +407,7 @@ class BodySystem:
         curvature = together(self.curvature, state.added)
         refuse_bare(self.bodies, P, Q, curvature)
         # modified Newton ignores changes of coefficients in P
-        self.solver.set_operator(P, K, curvature, Q, roughly=self.newton == "modified")
+        state.set_operator(self.solver, K, curvature, roughly=self.newton == "modified")
         linear = self.bodies.linear and not (self._soft or (self.linear is not None and self.linear.turning))
         # in dynamics momentum is conserved exactly by exact solves
         passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
