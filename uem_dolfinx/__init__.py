@@ -39,19 +39,19 @@ __all__ = [
     "Adaptation", "Adhesion", "Balance", "Ball", "BenzeggaghKenane", "CentralDifferences", "Checkpoint", "CheckpointError", "Cohesive",
     "Conductance", "ConflictError", "Contact", "ContactParameter", "ConvergenceError", "Coulomb", "Deck", "Dissipation", "Dynamics",
     "Elastic", "Energies", "EnergyBook", "EnergyGivenError", "Equation", "ErrorEstimate", "ErrorLimit", "Exponential", "FinitePlasticity",
-    "FloatingBodyError", "FrictionError", "GeneralContact", "Hinge", "History", "HistoryWriter", "InputError", "InputTypeError",
-    "InvertedElementError", "Leak", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeanMotion", "MeshError",
-    "MissingBackendError", "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError", "OutputError",
-    "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload", "Resultant",
-    "Results", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere", "RigidSurface", "Scheme",
-    "Slider", "SoftContact", "SpaceError", "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError", "Stribeck", "SurfaceError",
-    "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError", "UEMError", "UnitedProblem",
-    "UserFunctionError", "Vibrations", "ViscousFriction", "Voce", "VonMises", "adapt", "animate", "assemble_matrix", "assemble_vector",
-    "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx", "error_estimate", "errors", "example_mesh",
-    "figure", "form", "function_space", "generalised_alpha", "gradient", "integrate", "interpolate", "load_steps", "lumped_mass", "modes",
-    "multigrid_options", "newmark", "nodal_mass", "outline", "periodic", "plot_energies", "plot_history", "plot_pressure", "plot_scene",
-    "plot_setup", "read_checkpoint", "read_deck", "read_gmsh", "read_mesh", "read_results", "recording", "saddle_options", "tangent",
-    "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
+    "FloatingBodyError", "FrictionError", "GeneralContact", "GoalError", "Hinge", "History", "HistoryWriter", "InputError",
+    "InputTypeError", "InvertedElementError", "Leak", "LinearElastic", "LinearSolveError", "LoadStep", "Mass", "MassError", "MeanMotion",
+    "MeshError", "MissingBackendError", "MissingFileError", "NeoHooke", "Newton", "NotFiniteError", "OfTemperature", "OrientationError",
+    "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload",
+    "Resultant", "Results", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere",
+    "RigidSurface", "Scheme", "Slider", "SoftContact", "SpaceError", "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError",
+    "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError",
+    "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "ViscousFriction", "Voce", "VonMises", "adapt", "animate",
+    "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx",
+    "error_estimate", "errors", "example_mesh", "figure", "form", "function_space", "generalised_alpha", "goal_error", "gradient",
+    "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic",
+    "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_deck", "read_gmsh", "read_mesh",
+    "read_results", "recording", "saddle_options", "tangent", "taylor_test", "time_steps", "timing", "timings", "write_checkpoint",
 ]  # fmt: skip
 
 try:
@@ -118,6 +118,7 @@ from uem_dolfinx.solve.steps.load_steps import load_steps
 if _TYPE_CHECKING:
     from uem_dolfinx.accuracy.adapt import Adaptation, adapt
     from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+    from uem_dolfinx.accuracy.goal import GoalError, goal_error
     from uem_dolfinx.accuracy.limit import ErrorLimit
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
     from uem_dolfinx.conditions.equation import Equation, periodic
@@ -197,6 +198,7 @@ _LATER = {
     "plot_setup": "output.pictures",
     "Adaptation": "accuracy.adapt", "adapt": "accuracy.adapt",
     "ErrorEstimate": "accuracy.estimate", "error_estimate": "accuracy.estimate", "ErrorLimit": "accuracy.limit",
+    "GoalError": "accuracy.goal", "goal_error": "accuracy.goal",
     "ContactParameter": "gradients.parameters",
     "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
     "History": "gradients.history", "recording": "gradients.history",

@@ -10,9 +10,11 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
+import ufl
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+from uem_dolfinx.accuracy.goal import GoalError, goal_error
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, MeshError
 from uem_dolfinx.geometry.mesh_sizes import MeshSizes
@@ -40,7 +42,7 @@ class AdaptedMesh:
     Attributes:
         cells: number of cells.
         unknowns: number of components of displacements.
-        estimate: estimated error over the displacement, in the energy norm.
+        estimate: estimated error over the displacement, in the energy norm, or of a goal over its value.
         iterations: of Newton, in all steps; 0 if ``solve`` returns none.
         seconds: for the mesh, the solution and the estimate.
     """
@@ -58,13 +60,13 @@ class Adaptation:
 
     Attributes:
         problem: of the last mesh, solved.
-        estimate: of its error.
+        estimate: of its error, in the energy norm or of the goal.
         meshes: all meshes, in order.
         reached: whether the last mesh satisfies the tolerance or the number of cells.
     """
 
     problem: UnitedProblem
-    estimate: ErrorEstimate
+    estimate: ErrorEstimate | GoalError
     meshes: list[AdaptedMesh] = field(default_factory=list)
     reached: bool = True
 
@@ -81,6 +83,7 @@ def adapt(
     *,
     tolerance: float | None = None,
     cells: int | None = None,
+    goal: Callable[[UnitedProblem], ufl.Form] | None = None,
     solve: Callable[[UnitedProblem], Any] | None = None,
     meshes: int = 10,
 ) -> Adaptation:
@@ -94,6 +97,7 @@ def adapt(
             Curves and surfaces that the ``.geo`` file makes transfinite keep their cells.
         tolerance: bound on the estimated error over the displacement, in the energy norm; 0.05 is 5 %.
         cells: or the number of cells, which are spent where they serve most.
+        goal: returns a functional of a problem's displacement, of which the error over its value is estimated instead, see ``goal_error``.
         solve: solves a problem, e.g. ``lambda problem: list(uem.load_steps(problem, 10))``; by default in one load step.
         meshes: largest number of meshes.
 
@@ -115,6 +119,7 @@ def adapt(
             print(uem.adapt(make, tolerance=0.02))
     """
     given.kind("make", make, callable(make), "a function of the size of cells that returns a UnitedProblem")
+    given.kind("goal", goal, goal is None or callable(goal), "a function of the problem that returns a UFL form, or None")
     given.kind("solve", solve, solve is None or callable(solve), "a function of the problem, or None")
     if (tolerance is None) == (cells is None):
         raise InputError("adapt: expected either a tolerance or a number of cells")
@@ -130,7 +135,7 @@ def adapt(
         problem = make(size)
         given.kind("what make returns", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         steps = list(load_steps(problem, 1)) if solve is None else solve(problem)
-        estimate = error_estimate(problem)
+        estimate = error_estimate(problem) if goal is None else goal_error(problem, goal(problem))
         found.append(_measured(problem, estimate, steps, start))
         logger.info("mesh %d: %d cells, estimated error %.3g %%", len(found), found[-1].cells, 100 * found[-1].estimate)
         reached = enough(found, tolerance, cells)
@@ -141,7 +146,10 @@ def adapt(
                 )
             return Adaptation(problem, estimate, found, reached)
         mesh = problem.config.mesh
-        wanted = None if tolerance is None else (AIM * tolerance * estimate.norm) ** 2
+        # shares of a goal's error fall like squared errors in the energy norm
+        wanted, power = None, 2 if goal is None else 1
+        if tolerance is not None:
+            wanted = reduced(mesh.comm, float(estimate.shares.sum())) * (AIM * tolerance / estimate.relative) ** power
         if size is not None:
             scale *= float(np.clip(found[-1].cells / expected, 0.5, 2.0)) ** (1.0 / mesh.topology.dim)
             scale = scale if tolerance is None else min(scale, 1.0)
@@ -204,7 +212,7 @@ def cell_sizes(mesh: Any) -> Array:
     return np.asarray(np.linalg.norm(x[:, edges[:, 1]] - x[:, edges[:, 0]], axis=2).mean(axis=1))
 
 
-def _measured(problem: UnitedProblem, estimate: ErrorEstimate, steps: Any, start: float) -> AdaptedMesh:
+def _measured(problem: UnitedProblem, estimate: ErrorEstimate | GoalError, steps: Any, start: float) -> AdaptedMesh:
     """The figures of a mesh."""
     config = problem.config
     V, cells = config.u.function_space, config.mesh.topology.index_map(config.tdim).size_global

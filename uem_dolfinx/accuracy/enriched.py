@@ -11,17 +11,20 @@ H. Yserentant, Impact of Computing in Science and Engineering 1 (1989) 3-35]. It
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.accuracy.tractions import contact_tractions, outside
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.axisymmetry import revolved
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -34,14 +37,18 @@ class Enriched:
     Attributes:
         W: the space.
         test: its test function.
-        residual: of the state, at the owned nodes of W, zero at prescribed components ``(n, gdim)``.
+        degree: of the space.
+        nodes: its nodes.
+        forces: residual of the bodies without contacts, at the owned nodes of W, zero at prescribed components ``(n, gdim)``.
+        residual: the same with the contact tractions.
         energy: ``u' K u`` of the displacement.
     """
 
     def __init__(self, problem: UnitedProblem):
         self.problem, config = problem, problem.config
         self.g, bodies = config.gdim, problem.bodies
-        self.W = compat.function_space(config.mesh, config.degree + 1, (self.g,))
+        self.degree = config.degree + 1
+        self.W = compat.function_space(config.mesh, self.degree, (self.g,))
         self.cells = compat.cell_dofs(self.W)
         self.test = ufl.TestFunction(self.W)
         self.held = self._held()
@@ -55,11 +62,27 @@ class Enriched:
 
         self._stiffness = stiffness(trial, self.test)
         self.energy = abs(forms.assemble_scalar(stiffness(config.whole, config.whole), config.comm))
-        F = ufl.replace(F, {test: self.test})
-        found = contact_tractions(problem)
-        form = F if found is None else F - ufl.inner(found[0], self.test) * found[1]
+        self.forces = self.residual = self.assembled(ufl.replace(F, {test: self.test}))
+        if (found := contact_tractions(problem)) is not None:
+            self.residual = self.forces - self.assembled(ufl.inner(found[0], self.test) * found[1])
+
+    @cached_property
+    def nodes(self) -> Nodes:
+        """Nodes of W (first time: collective)."""
+        return Nodes(self.W)
+
+    def assembled(self, form: ufl.Form) -> Array:
+        """A linear form at the owned nodes of W, zero at prescribed components ``(n, gdim)`` (collective)."""
         own = forms.assemble_array(self.W, forms.form(form)).reshape(-1, self.g)
-        self.residual = np.where(self.held[: len(own)], 0.0, own)
+        return np.where(self.held[: len(own)], 0.0, own)
+
+    def stiffness(self) -> PETSc.Mat:
+        """K of the whole space, with the identity at prescribed components (collective)."""
+        A = forms.create_matrix(self._stiffness)
+        forms.assemble_matrix(A, self._stiffness)
+        first = self.g * self.nodes.first
+        A.zeroRowsColumns((first + np.flatnonzero(self.held[: len(self.residual)])).astype(PETSc.IntType), diag=1.0)
+        return A
 
     def energies(self) -> Array:
         """``|r_E' A_E^-1 r_E|``, shared by the cells of each E ``(n_owned_cells,)`` (collective)."""
@@ -71,6 +94,10 @@ class Enriched:
         for nodes in self._entities():
             of_nodes[nodes[:, 0]] = self._block_energies(inside, nodes)
         A.destroy()
+        return self.of_cells(of_nodes)
+
+    def of_cells(self, of_nodes: Array) -> Array:
+        """Values of the owned nodes of W ``(n,)``, shared by the cells around each of them ``(n_owned_cells,)`` (collective)."""
         n = self.problem.config.mesh.topology.index_map(self.problem.config.tdim).size_local
         shares = fem.Function(self.W)
         view = shares.x.array.reshape(-1, self.g)
@@ -122,4 +149,8 @@ class Enriched:
         for k in range(self.g):
             # nodes of facets of other ranks as well
             found[fem.locate_dofs_topological(self.W, dim, facets[whole[:, k]]), k] = True
+        # single nodes that hold a body
+        vertices = len(forms.reference_topology(compat.cell_name(problem.config.mesh))[0])
+        of_solution = compat.cell_dofs(problem.config.u.function_space)
+        found[self.cells[:, :vertices]] |= held[of_solution[:, :vertices]]
         return found

@@ -73,7 +73,7 @@ def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
-        _refuse(problem)
+        refuse_estimate(problem)
     config = problem.config
     with timed("estimate errors"):
         enriched = Enriched(problem)
@@ -96,7 +96,7 @@ def _by_body(problem: UnitedProblem, values: Array) -> Array:
     return body_sums(config.comm, values[:, None], of_cells, count)[order, 0]
 
 
-def _refuse(problem: UnitedProblem) -> None:
+def refuse_estimate(problem: UnitedProblem) -> None:
     """Refuse problems whose residual is more than a form of the displacement, or not in equilibrium."""
     for present, what in (
         (not problem.config.moves or problem.config.unknowns.mixed, "other fields than a displacement"),

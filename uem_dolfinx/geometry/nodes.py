@@ -145,6 +145,10 @@ class Nodes:
         """Ranks that own global nodes."""
         return np.searchsorted(self._first_nodes, nodes, side="right") - 1
 
+    def first_of(self, ranks: Ints) -> Ints:
+        """First global node of ranks ``(n,)``."""
+        return np.asarray(self._first_nodes[ranks])
+
     def gather_owned(self, nodes: Ints) -> Ints:
         """Owned local nodes among the global ``nodes (m,)`` of all ranks, each once, sorted (collective)."""
         (owned,) = Exchange.to(self.comm, self.owner_of(nodes)).send(nodes)

@@ -1,0 +1,199 @@
+"""Estimates of the error of functionals: where contact ends anywhere, at sharp corners, and for meshes that follow them.
+
+Read first: ``test_effectivity``.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from helpers import refused, slow
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat, forms
+from uem_dolfinx.accuracy.enriched_rows import bernstein, composite_rule
+
+COMM = MPI.COMM_WORLD
+
+
+def blocks(scene, n, degree=1, coupling="node_to_surface", finer=1.0, law=uem.LinearElastic, scale=1.0, friction=0.0, comm=COMM):
+    """A sharp block half as wide as the lower one, or two equal blocks of which a load at one side opens the other; and goals."""
+    parameters = {"n_lower": n, "n_upper": round(n * finer)}
+    mesh, tags = uem.read_gmsh(uem.example_mesh("two_blocks"), comm, gdim=2, parameters=parameters)
+    if scene == "sharp":
+        upper = np.unique(compat.geometry_dofs(mesh)[tags["upper"].entities])
+        mesh.geometry.x[upper, 0] = 0.25 + 0.5 * mesh.geometry.x[upper, 0]
+    mesh.geometry.x[:] *= scale
+    V = uem.function_space(mesh, degree, (2,))
+    u, v, X = fem.Function(V), ufl.TestFunction(V), ufl.SpatialCoordinate(mesh) / scale
+    F = law(100.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["lower_bottom"])]
+    if scene == "sharp":
+        bcs.append(uem.dirichlet(V, tags["upper_top"], value=(0, -0.02 * scale)))
+    else:
+        F += (1 - X[0]) ** 4 * v[1] * uem.ds(tags["upper_top"])
+        bcs.append(uem.dirichlet(V, tags["upper_top"], 0))
+    contact = uem.Contact(tags["upper_bottom"], tags["lower_top"], coupling=coupling, friction=friction)
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    problem.solve()
+    low = uem.dx(tags["lower"])
+    goals = {
+        "displacement": u[1] * low,
+        "stress": (ufl.grad(u)[1, 1] + 0.4 * ufl.grad(u)[0, 0]) * low,
+        "force": force(F, tags["lower_bottom"]),
+    }
+    if scene == "tilted":
+        goals = {"displacement": u[1] * uem.ds(tags["upper_top"])}
+    return problem, goals
+
+
+def punch(size=None, degree=1, h=0.5):
+    """A block under a rigid flat punch, whose force and whose bulge at the side are wanted."""
+    mesh, tags = uem.read_gmsh(uem.example_mesh("adapt_punch"), COMM, gdim=2, parameters={"h": h}, size=size)
+    V = uem.function_space(mesh, degree, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["bottom"], 1, 0.01)]
+    contact = uem.Contact(tags["under_punch"], uem.RigidPlane((0.0, 0.0), (0.0, -1.0)))
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    problem.solve()
+    return problem, {"force": force(F, tags["bottom"]), "displacement": ufl.SpatialCoordinate(mesh)[0] * u[0] * ufl.dx}
+
+
+def force(F, tag):
+    """The upward force on a part, as the work of the residual along a unit displacement of its nodes."""
+    v = F.arguments()[0]
+    w = fem.Function(v.ufl_function_space())
+    w.x.array.reshape(-1, 2)[fem.locate_dofs_topological(w.function_space, tag.dim, tag.entities), 1] = 1.0
+    w.x.scatter_forward()
+    return ufl.replace(F, {v: w})
+
+
+def value(J):
+    return COMM.allreduce(fem.assemble_scalar(forms.form(J)))
+
+
+@cache
+def exact(scene):
+    """Goals of a fine mesh, and for a sharp corner, where the order is 1, of the limit of two."""
+    if scene == "punch":
+        with_h = [{k: value(J) for k, J in punch(degree=2, h=h)[1].items()} for h in (0.0625, 0.03125)]
+    else:
+        with_h = [{k: value(J) for k, J in blocks(scene, n, 2, "mortar")[1].items()} for n in (16, 32)]
+    return {k: v + (v - with_h[0][k]) * (scene != "tilted") for k, v in with_h[1].items()}
+
+
+#: Scene, cells, degree, coupling, and cells of the contactor over those of the target.
+CASES = [
+    (scene, n, degree, coupling, finer)
+    for scene, n, finer in (("sharp", 8, 1.5), ("sharp", 4, 1.0), ("sharp", 8, 0.5), ("tilted", 8, 1.0), ("tilted", 8, 2.0))
+    for degree in (1, 2)
+    for coupling in ("node_to_surface", "mortar")
+]
+FAST = CASES[0], CASES[15]
+
+
+@pytest.mark.parametrize("scene, n, degree, coupling, finer", [case if case in FAST else slow(*case) for case in CASES])
+def test_effectivity(scene, n, degree, coupling, finer):
+    """Estimates have the sign of the error, and 0.5 to 1.5 of its size, for forces, displacements and stresses."""
+    problem, goals = blocks(scene, n, degree, coupling, finer)
+    for name, J in goals.items():
+        found = uem.goal_error(problem, J)
+        assert np.isclose(found.value, value(J), rtol=1e-12)
+        ratio = found.error / (exact(scene)[name] - found.value)
+        assert 0.5 < ratio < 1.5, (name, ratio)
+
+
+@pytest.mark.parametrize("degree, coupling", [(1, "node_to_surface"), (2, "mortar")])
+def test_partitions(degree, coupling):
+    """The estimate and its largest part do not depend on the number of ranks."""
+    found = []
+    for comm in (MPI.COMM_SELF, COMM):
+        problem, goals = blocks("tilted", 4, degree, coupling, 1.5, comm=comm)
+        one = uem.goal_error(problem, goals["displacement"])
+        found.append((one.error, comm.allreduce(one.shares.max(initial=0.0), op=MPI.MAX), comm.allreduce(one.shares.sum())))
+    assert np.allclose(found[0], found[1], rtol=1e-6) and found[0][1] > 0
+
+
+@pytest.mark.parametrize("degree", [1, slow(2)])
+def test_a_rigid_punch(degree):
+    """The same under a rigid target with a sharp corner."""
+    problem, goals = punch(degree=degree, h=0.25)
+    for name, J in goals.items():
+        found = uem.goal_error(problem, J)
+        assert 0.5 < found.error / (exact("punch")[name] - found.value) < 1.5, name
+
+
+@pytest.mark.parametrize("degree", [slow(1), slow(2)])
+def test_meshes_for_a_force(degree):
+    """The force on a punch to a tolerance, on fewer cells than uniform meshes need for the same."""
+    tolerance = (0.01, 0.002)[degree - 1]
+    goals = {}
+
+    def make(size):
+        problem, of_problem = punch(size, degree)
+        goals[problem] = of_problem["force"]
+        return problem
+
+    found = uem.adapt(make, goal=goals.get, tolerance=tolerance)
+    error = abs(found.estimate.value / exact("punch")["force"] - 1)
+    assert found.reached and found.estimate.relative <= tolerance and error < 2 * tolerance
+    uniform, goals = punch(degree=degree, h=0.125)
+    cells = uniform.config.mesh.topology.index_map(2).size_global
+    assert found.meshes[-1].cells < cells and error < abs(value(goals["force"]) / exact("punch")["force"] - 1)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_patches_have_no_error(degree):
+    """A constant stress through meshes that do not match, by mortar, has the exact force, to the rule on facets with kinks."""
+    mesh, tags = uem.read_gmsh(uem.example_mesh("two_blocks"), COMM, gdim=2, parameters={"n_lower": 3, "n_upper": 4})
+    V = uem.function_space(mesh, degree, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(100.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [
+        uem.dirichlet(V, tags["sides"], 0),
+        uem.dirichlet(V, tags["lower_bottom"], 1),
+        uem.dirichlet(V, tags["upper_top"], 1, -0.05),
+    ]
+    contact = uem.Contact(tags["upper_bottom"], tags["lower_top"], coupling="mortar")
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    problem.solve()
+    assert uem.goal_error(problem, force(F, tags["upper_top"])).relative < 1e-5
+
+
+def test_units_and_strain():
+    """The relative estimate does not depend on units of length, and large strain is estimated as small strain where it is small."""
+    found = []
+    for law, scale in ((uem.LinearElastic, 1.0), (uem.LinearElastic, 1e-6), (uem.NeoHooke, 1.0)):
+        problem, goals = blocks("sharp", 4, law=law, scale=scale)
+        found.append(uem.goal_error(problem, goals["force"]).relative)
+    assert np.isclose(found[0], found[1], rtol=1e-6) and np.isclose(found[0], found[2], rtol=0.1)
+
+
+@pytest.mark.parametrize("cell", ["interval", "triangle", "quadrilateral"])
+@pytest.mark.parametrize("degree", [2, 3])
+def test_functions_and_rules(cell, degree):
+    """Bernstein's functions sum up to 1 with equal integrals, under a rule in pieces."""
+    xi, weights = composite_rule(cell, 2 * degree, 4)
+    values = bernstein(cell, degree, xi)
+    assert np.allclose(values.sum(axis=1), 1.0) and values.min() > 0
+    assert np.allclose(weights @ values, weights.sum() / values.shape[1])
+    assert np.isclose(weights.sum(), 0.5 if cell == "triangle" else 1.0)
+
+
+def test_what_has_no_estimate():
+    """Refused by name."""
+    problem, goals = blocks("sharp", 2)
+    fixed = fem.Constant(problem.config.mesh, 1.0) * ufl.dx
+    refused(uem.InputError, "nothing that the problem solves for", lambda: uem.goal_error(problem, fixed))
+    refused(uem.InputTypeError, "UFL form", lambda: uem.goal_error(problem, 1.0))
+    refused(uem.InputTypeError, "UnitedProblem", lambda: uem.goal_error(problem.u, goals["force"]))
+    rubbing, goals = blocks("sharp", 2, friction=0.2)
+    refused(uem.InputError, "friction", lambda: uem.goal_error(rubbing, goals["force"]))
+    refused(uem.InputTypeError, "goal", lambda: uem.adapt(lambda size: punch(size)[0], tolerance=0.1, goal=3))

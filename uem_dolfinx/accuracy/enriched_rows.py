@@ -1,0 +1,233 @@
+"""Conditions of the contacts in the space of one degree more, on the contactors of a solution.
+
+    integral of phi_i (n . (w_c - w_t) + g) >= 0          for each contactor i, and zero for an active one
+
+w_c and w_t are values of a function w of that space on the contactor and at the closest point of the target, g is the gap that the
+solution leaves, and phi_i a Bernstein function of that space on the contactor. Both couplings and rigid targets get the
+same conditions; ties have one for each component.
+"""
+
+from __future__ import annotations
+
+from math import factorial
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import basix
+import numpy as np
+
+from uem_dolfinx import compat, forms
+from uem_dolfinx.accuracy.enriched import Enriched
+from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
+from uem_dolfinx.geometry.shapes import area_vectors, facet_shape
+from uem_dolfinx.parallel import gathered
+
+#: Pieces of a rule along each side of a contactor facet, on which kinks of the target lie anywhere.
+#: [bound; pieces; test_goal.py::test_effectivity]
+PIECES = 4
+
+
+class EnrichedRows(NamedTuple):
+    """Entries of the equations that this rank has integrated.
+
+    Attributes:
+        row: global number of the equation ``(k,)``.
+        node: global node of the enriched space ``(k,)``.
+        value: entries at its components, zero where these are prescribed ``(k, gdim)``.
+        gap_row: global number of the equation of each part of a gap ``(j,)``.
+        gap: parts of the weighted gaps ``(j,)``.
+        active: whether the solution's contactors of the rank's own equations are active ``(m,)``.
+        tied: whether their equations always are ``(m,)``.
+        first: first equation of every rank, and one past the last.
+    """
+
+    row: Ints
+    node: Ints
+    value: Array
+    gap_row: Ints
+    gap: Array
+    active: Bools
+    tied: Bools
+    first: Ints
+
+
+def enriched_rows(enriched: Enriched) -> EnrichedRows:
+    """Equations of all contacts of a problem (collective)."""
+    config, comm = enriched.problem.config, enriched.problem.comm
+    parts = [_none(config.gdim)]
+    states: list[tuple[Bools, Bools]] = []
+    surfaces = [_Surface(enriched, contact) for contact in enriched.problem.contacts]
+    first = np.append(0, np.cumsum(gathered(comm, sum(len(one.nodes) * one.width for one in surfaces))))
+    at = int(first[comm.rank])
+    for one in surfaces:
+        count = len(one.nodes) * one.width
+        parts.append(one.entries(at))
+        states.append((np.repeat(one.active, one.width), np.full(count, one.tied)))
+        at += count
+    active, tied = (np.concatenate([np.zeros(0, bool), *part]) for part in (zip(*states) if states else ([], [])))
+    row, node, value, gap_row, gap = (np.concatenate(part) for part in zip(*parts))
+    return EnrichedRows(row, node, value, gap_row, gap, active, tied, first)
+
+
+def _none(gdim: int) -> list[Any]:
+    return [np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, gdim)), np.zeros(0, np.int64), np.zeros(0)]
+
+
+class _Surface:
+    """The contactor's surface of a contact in the enriched space (collective).
+
+    Attributes:
+        nodes: owned nodes of the space on it ``(n,)``.
+        active: whether all contactors of a facet around them are active ``(n,)``.
+        width: number of equations of a node.
+    """
+
+    def __init__(self, enriched: Enriched, contact: Contact):
+        config, self.enriched, self.contact = enriched.problem.config, enriched, contact
+        self.facets = facets_of(config, contact.contactor, "contactor")
+        of_space: Any = SimpleNamespace(V=enriched.W, mesh=config.mesh, tdim=config.tdim, degree=enriched.degree)
+        self.dofs = nodes_of_facets(of_space, contact.contactor).dofs
+        self.tied, self.width = contact.tied is not False, config.gdim if contact.tied else 1
+        pair, nodes = contact.pair, enriched.nodes
+        state = np.zeros((config.n_owned, 1))
+        state[pair.nodes, 0] = pair.tied if self.tied else pair.trial.active
+        whole = self._of_nodes(state).min(axis=1, initial=1.0)
+        found = [
+            nodes.to_owners(self.dofs.ravel(), np.repeat(v, self.dofs.shape[1]))[: nodes.n_owned]
+            for v in (np.ones(len(whole)), whole)
+        ]
+        self.nodes = np.flatnonzero(found[0] > 0)
+        self.active: Bools = found[1][self.nodes] > 0
+
+    def _of_nodes(self, values: Array) -> Array:
+        """Values at the displacement's owned nodes ``(n_owned, 1)``, at those of the facets ``(m, nn)`` (collective)."""
+        config, dofs = self.enriched.problem.config, self.facets.dofs
+        return np.asarray(config.from_owners(np.arange(config.n_owned), values, dofs.ravel()).reshape(dofs.shape))
+
+    def entries(self, first: int) -> list[Any]:
+        """Entries of the equations, which on this rank begin with the number ``first`` (collective)."""
+        enriched, contact, facets = self.enriched, self.contact, self.facets
+        config, target = enriched.problem.config, contact.pair.discretisation.target
+        gdim, nodes = config.gdim, enriched.nodes
+        numbers = np.zeros((nodes.n_owned, self.width))
+        numbers[self.nodes] = first + np.arange(len(self.nodes) * self.width).reshape(-1, self.width)
+        at = (
+            nodes.from_owners(np.arange(nodes.n_owned), numbers, self.dofs.ravel())
+            .reshape(*self.dofs.shape, self.width)
+            .astype(np.int64)
+        )
+        xi, weights = composite_rule(facets.shape.cell, 2 * enriched.degree, PIECES)
+        N, n_q = facets.shape.functions(xi), len(xi)
+        X = config.X[facets.dofs]
+        size = np.stack(
+            [
+                w * np.linalg.norm(area_vectors(facets.shape.tabulate(np.tile(q, (len(facets.dofs), 1))), X), axis=1)
+                for q, w in zip(xi, weights)
+            ],
+            axis=1,
+        )
+        if config.axisymmetric:
+            size *= 2.0 * np.pi * X[:, :, 0] @ N.T
+        projection = _projected(contact, np.einsum("qa,nag->nqg", N, X), np.einsum("qa,nag->nqg", N, config.x[facets.dofs]))
+        opposite = ~projection.beyond.any(axis=1)
+        if target.n_nodes:
+            opposite &= projection.facet >= 0
+        area = np.where(opposite, size.ravel(), 0.0)
+        gap = np.where(opposite, projection.gap, 0.0)
+        if (offset := contact.pair.discretisation.offset) is not None:
+            of_nodes = np.zeros((config.n_owned, 1))
+            of_nodes[contact.pair.nodes, 0] = offset
+            gap = gap - (self._of_nodes(of_nodes) @ N.T).ravel()
+        directions = np.broadcast_to(np.eye(gdim), (len(gap), gdim, gdim)) if contact.tied else projection.normal[:, None]
+        gap = np.zeros((len(gap), gdim)) if contact.tied else gap[:, None]
+        # which facet and point of the rule
+        facet, point = np.divmod(np.arange(len(facets.dofs) * n_q), n_q)
+        here = _local(enriched, facets, facet, xi[point])
+        sides = [(1.0, *here)]
+        if target.n_nodes:
+            faceted: Any = target
+            sides.append((-1.0, *_on_target(enriched, faceted.facets, projection)))
+        test = area[:, None] * bernstein(facets.shape.cell, enriched.degree, xi)[point]
+        found: list[list[Any]] = [[], [], []]
+        for sign, there, values, free in sides:
+            # (points, test, direction, node, component)
+            value = sign * np.einsum("pt,pdg,pn,png->ptdng", test, directions, values, free)
+            shape = value.shape[:-1]
+            found[0].append(np.broadcast_to(at[facet][:, :, :, None], shape).ravel())
+            found[1].append(np.broadcast_to(there[:, None, None, :], shape).ravel())
+            found[2].append(value.reshape(-1, gdim))
+        weighted = test[:, :, None] * gap[:, None, :]
+        return [*(np.concatenate(part) for part in found), at[facet].ravel(), weighted.ravel()]
+
+
+def bernstein(cell: str, degree: int, xi: Array) -> Array:
+    """Bernstein's functions, numbered as the nodes of a facet of any degree, at ``xi (n, fdim)``: ``(n, nn)``."""
+
+    def extended(points: Array) -> Array:
+        """Pairs of coordinates of a sum of 1, one after the other; on a triangle three coordinates of a sum of 1."""
+        if cell == "triangle":
+            return np.column_stack([1 - points.sum(axis=1), points])[:, None]
+        return np.stack([1 - points, points], axis=2)
+
+    # nodes lie near those of equal distances
+    powers = np.rint(degree * extended(facet_shape(cell, degree).nodes)).astype(int)
+    b = extended(xi)[:, None]
+    counts = factorial(degree) / np.vectorize(factorial)(powers).prod(axis=2)
+    return np.asarray((b**powers).prod(axis=(2, 3)) * counts.prod(axis=1))
+
+
+def composite_rule(cell: str, degree: int, pieces: int) -> tuple[Array, Array]:
+    """Points ``(n, fdim)`` and weights ``(n,)`` of a rule in each of ``pieces`` along every side of a reference facet."""
+    xi, weights = forms.quadrature_rule(cell, degree)
+    d = xi.shape[1]
+    corners = np.stack(np.meshgrid(*[np.arange(pieces)] * d, indexing="ij"), axis=-1).reshape(-1, d)
+    if cell == "triangle":
+        inside = corners.sum(axis=1) < pieces
+        turned = corners.sum(axis=1) < pieces - 1
+        parts = [corners[inside][:, None] + xi, corners[turned][:, None] + 1.0 - xi]
+        points = np.concatenate([part.reshape(-1, d) for part in parts])
+    else:
+        points = (corners[:, None] + xi).reshape(-1, d)
+    return points / pieces, np.tile(weights, len(points) // len(weights)) / pieces**d
+
+
+def _projected(contact: Contact, drawn: Array, now: Array) -> Any:
+    """Projection of points of the contactor, in the reference configuration and now ``(n, q, gdim)``, onto its target (collective)."""
+    config, target = contact.pair.config, contact.pair.discretisation.target
+    drawn, now = (points.reshape(-1, config.gdim) for points in (drawn, now))
+    if contact.sliding != "fixed" or not target.n_nodes:
+        return target.project(now)
+    with config.at(np.zeros(len(config.whole.x.array))):
+        anchor = target.project(drawn)
+    return target.follow(now, anchor)
+
+
+def _local(enriched: Enriched, facets: TargetFacets, which: Ints, xi: Array) -> tuple[Ints, Any, Any]:
+    """Nodes of the enriched space in the cells of this rank's facets, and their functions at points ``xi (n, fdim)`` of the facets.
+
+    Returns:
+        Global nodes ``(n, nn)``, functions ``(n, nn)``, and 1 for their free components ``(n, nn, gdim)``.
+    """
+    cell = compat.cell_name(enriched.problem.config.mesh)
+    corners, topology = basix.geometry(getattr(basix.CellType, cell)), forms.reference_topology(cell)
+    tdim = enriched.problem.config.tdim
+    vertices = corners[np.array(topology[tdim - 1])[facets.sides[which]]]
+    points = np.einsum("na,nag->ng", facet_shape(facets.shape.cell, 1).functions(xi), vertices)
+    nodes = enriched.cells[facets.cells[which]]
+    if not len(points):
+        return enriched.nodes.to_global(nodes), np.zeros(nodes.shape), np.zeros((*nodes.shape, enriched.g))
+    values = forms.create_lagrange_element(cell, enriched.degree).tabulate(0, np.ascontiguousarray(points))[0, :, :, 0]
+    return enriched.nodes.to_global(nodes), values, 1.0 * ~enriched.held[nodes]
+
+
+def _on_target(enriched: Enriched, facets: TargetFacets, projection: Any) -> tuple[Ints, Array, Array]:
+    """As ``_local``, at the feet of a projection on facets of any rank (collective)."""
+    exchange = facets.owners(projection.facet)
+    asked, xi = exchange.send(projection.facet, projection.xi)
+    answers = exchange.back(*_local(enriched, facets, asked - facets.first[enriched.problem.comm.rank], xi))
+    found = [np.zeros((len(projection.facet), *answer.shape[1:]), answer.dtype) for answer in answers]
+    for into, answer in zip(found, answers):
+        into[exchange.rows] = answer
+    return found[0], found[1], found[2]

@@ -1,0 +1,261 @@
+"""goal_error: the error of a functional by the mesh, from a linear problem of both bodies in a space of one degree more.
+
+With the residual r of a solution u in that space, its stiffness K there, and active contacts B with their gaps g (``enriched_rows``),
+
+    [ K  B' ] [ w ]   [ -r ]          [ K  B' ]' [ z ]   [ dJ/du ]
+    [ B  0  ] [ . ] = [ -g ]          [ B  0  ]  [ . ] = [   0   ]
+
+w leads to the solution of one degree more, in which contactors become active and are released as in the first one. So ``J'(w)``
+estimates the error of J [R. Becker, R. Rannacher, Acta Numerica 10 (2001) 1-102]. The adjoint solution z gives the cells that it comes
+from: with its part z_h of the solution's own degree, they are those of ``r (z - z_h)``, where r includes the contact tractions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+from scipy.sparse import coo_matrix
+
+from uem_dolfinx import compat, forms, given
+from uem_dolfinx.accuracy.enriched import Enriched
+from uem_dolfinx.accuracy.enriched_rows import EnrichedRows, enriched_rows
+from uem_dolfinx.accuracy.estimate import refuse_estimate
+from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError
+from uem_dolfinx.form_checks import check_functional
+from uem_dolfinx.geometry.axisymmetry import revolved
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.log import timed
+from uem_dolfinx.parallel import Exchange, agreed, gathered, reduced
+from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.steps.parted import part_contacts
+
+#: Changes of the active set in the linear problem of a goal's error.
+#: [bound; factorisations; -]
+MOST_SETS = 10
+
+
+@dataclass(frozen=True)
+class GoalError:
+    """An estimate of the error of a functional by the mesh.
+
+    Attributes:
+        value: of the functional.
+        error: estimate of the exact value less this one.
+        cells: part of each cell in it, without sign, a Function that is constant in cells, for files and pictures.
+        shares: the same of this rank's cells ``(n_owned_cells,)``.
+    """
+
+    value: float
+    error: float
+    cells: fem.Function = field(repr=False)
+    shares: Array = field(repr=False)
+
+    @property
+    def relative(self) -> float:
+        """Size of the estimate over that of the value; NaN for a value of zero."""
+        return abs(self.error / self.value) if self.value else float("nan")
+
+    def __str__(self) -> str:
+        """The value, and the estimate in per cent."""
+        return f"value {self.value:.6g}, error by the mesh: {100 * self.relative:.3g} %"
+
+
+def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
+    """Estimate the error of a functional of the displacement by its mesh (collective).
+
+    A linear problem of one degree more is solved for both bodies together, on the same mesh and with the same contactors. It takes the time
+    of a factorisation of about four times as many unknowns as degree 1 has, and of twice as many as degree 2 has.
+
+    Args:
+        problem: in statics, in equilibrium, as ``solve`` or a step leaves it.
+        J: a UFL form of the displacement, e.g. ``u[0] * uem.ds(tags["top"])``, or for the force on a part the residual with a Function
+            in place of its test function.
+
+    Returns:
+        The value, the estimate, and the parts of the cells.
+
+    Raises:
+        InputError, InputTypeError: for what ``error_estimate`` refuses, friction, histories, couplings and general contact.
+        MissingBackendError: if PETSc has neither MUMPS nor SuperLU_DIST.
+
+    Example:
+        ::
+
+            problem.solve()
+            print(uem.goal_error(problem, problem.u[1] * uem.ds(tags["top"])))
+    """
+    check_goal(problem, J)
+    config, whole = problem.config, revolved(J)
+    with timed("estimate errors"):
+        enriched = Enriched(problem)
+        value = forms.assemble_scalar(forms.form(whole), config.comm)
+        of_u = enriched.assembled(forms.expanded(ufl.derivative(whole, config.whole, enriched.test)))
+        rows = enriched_rows(enriched)
+        system = _System(enriched, rows)
+        error = reduced(config.comm, float((of_u * system.correction(-enriched.forces)).sum()))
+        z = fem.Function(enriched.W)
+        z.x.array[: of_u.size] = system.solve(of_u, np.zeros(len(system.gaps)), back=True)[0].ravel()
+        z.x.scatter_forward()
+        system.close()
+        z_h, again = fem.Function(config.V), fem.Function(enriched.W)
+        z_h.interpolate(z)
+        again.interpolate(z_h)
+        away = (z.x.array - again.x.array)[: of_u.size].reshape(of_u.shape)
+        shares = enriched.of_cells(np.abs((enriched.residual * away).sum(axis=1)))
+    cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="goal_error")
+    cells.x.array[: len(shares)] = shares
+    cells.x.scatter_forward()
+    return GoalError(float(value), float(error), cells, shares)
+
+
+def check_goal(problem: UnitedProblem, J: ufl.Form) -> None:
+    """Refuse problems without an enriched linear problem, and functionals of more than the displacement (collective)."""
+    given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    # the equations are those of single contacts
+    part_contacts(problem)
+    with agreed(problem.comm):
+        refuse_estimate(problem)
+        given.kind("goal", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral, of the displacement")
+        check_functional("goal", J, problem.config.mesh)
+        if any(f.name.startswith("contact_") for f in J.coefficients()):
+            raise InputError("goal: holds a result of a contact: expected the displacement; of forces take the residual")
+        if not any(f is problem.u for f in J.coefficients()):
+            raise InputError("goal: holds nothing that the problem solves for: expected problem.u")
+        for present, what in (
+            (bool(problem.materials), "a law with history"),
+            (any(pair.frictional for pair in problem.pairs), "friction"),
+            (
+                any(c.normal is not None or c.cohesion is not None or c.leak is not None for c in problem.contacts),
+                "a law of gaps",
+            ),
+            (bool(problem.couplings) or bool(problem.points), "rigid couplings, or forces or springs at points"),
+            (any(hasattr(contact, "parts") for contact in problem.declared), "general contact"),
+            (
+                any(not _of_facets(problem, contact) for contact in problem.contacts),
+                "contactors that are points, or corners=True",
+            ),
+        ):
+            if present:
+                raise InputError(f"the problem has {what}, which an estimate of a goal's error does not include")
+
+
+def _of_facets(problem: UnitedProblem, contact: Contact) -> bool:
+    """Whether contactors are the nodes of facets."""
+    tag = contact.contactor
+    return isinstance(tag, Tag) and tag.dim == problem.config.tdim - 1 and not contact.corners_touch()
+
+
+class _System:
+    """The linear problem of one degree more; unknowns of a rank are its components of nodes, then its multipliers."""
+
+    ksp: PETSc.KSP | None = None
+    matrix: PETSc.Mat
+
+    def __init__(self, enriched: Enriched, rows: EnrichedRows):
+        comm, g = enriched.problem.comm, enriched.g
+        self.comm, self.shape, self.n = comm, enriched.residual.shape, enriched.residual.size
+        self.active, self.tied, m = rows.active.copy(), rows.tied, len(rows.active)
+        self.first = first = np.append(0, np.cumsum(gathered(comm, self.n + m)))
+        nodes = enriched.nodes
+
+        def of_components(components: Ints) -> Ints:
+            owner = nodes.owner_of(components // g)
+            return np.asarray(first[owner] + components - g * nodes.first_of(owner))
+
+        def of_rows(row: Ints) -> Ints:
+            owner = np.searchsorted(rows.first, row, side="right") - 1
+            # multipliers come last on each rank
+            return np.asarray(first[owner + 1] - rows.first[owner + 1] + row)
+
+        A = enriched.stiffness()
+        starts, columns, values = A.getValuesCSR()
+        i = np.repeat(np.arange(self.n), np.diff(starts))
+        self._K = coo_matrix((values, (i, of_components(columns.astype(np.int64)))), shape=(self.n + m, int(first[-1]))).tocsr()
+        A.destroy()
+        row, entries = np.repeat(of_rows(rows.row), g), rows.value.ravel()
+        column = of_components((rows.node[:, None] * g + np.arange(g)).ravel())
+        there = Exchange.to(comm, np.where(entries != 0.0, np.searchsorted(first, row, side="right") - 1, -1))
+        at, column, entries = there.send(row, column, entries)
+        B = coo_matrix((entries, (at - first[comm.rank] - self.n, column)), shape=(m, int(first[-1]))).tocsr()
+        self._B, layout = B, ((m, int(rows.first[-1])), (self.n + m, int(first[-1])))
+        self._openings = PETSc.Mat().createAIJ(layout, csr=(B.indptr, B.indices, B.data), comm=comm)
+        gap_row, gap = Exchange.to(comm, np.searchsorted(rows.first, rows.gap_row, side="right") - 1).send(rows.gap_row, rows.gap)
+        self.gaps: Array = np.asarray(np.bincount(gap_row - rows.first[comm.rank], gap, m), dtype=float)
+        self.active &= np.diff(B.indptr) > 0
+
+    def _factorise(self) -> None:
+        """Factorise with the equations that are active; others keep their multipliers at zero (collective)."""
+        self.close()
+        begin, B = self.first[self.comm.rank], self._B.copy()
+        B.data *= np.repeat(self.active, np.diff(B.indptr))
+        B.eliminate_zeros()
+        B = B.tocoo()
+        rows, last = begin + self.n + B.row, begin + self.n + np.arange(len(self.active))
+        there = Exchange.to(self.comm, np.searchsorted(self.first, B.col, side="right") - 1)
+        i, j, v = there.send(B.col.astype(np.int64), rows.astype(np.int64), B.data)
+        entries = (np.concatenate([i, rows, last]) - begin, np.concatenate([j, B.col, last]))
+        values = np.concatenate([v, B.data, np.where(self.active, 0.0, 1.0)])
+        whole = (self._K + coo_matrix((values, entries), shape=self._K.shape)).tocsr()
+        sizes = whole.shape
+        self.matrix = PETSc.Mat().createAIJ((sizes, sizes), csr=(whole.indptr, whole.indices, whole.data), comm=self.comm)
+        self.ksp = _factorised(self.matrix)
+
+    def close(self) -> None:
+        """Destroy the matrix and its factors (collective)."""
+        if self.ksp is not None:
+            self.ksp.destroy()
+            self.matrix.destroy()
+
+    def correction(self, forces: Array) -> Array:
+        """The displacement w by forces on the bodies ``(n, gdim)``, with the active contactors found anew (collective)."""
+        for _ in range(MOST_SETS):
+            self._factorise()
+            w, lam = self.solve(forces, np.where(self.active, -self.gaps, 0.0))
+            x, opening = self._openings.createVecs()
+            x.array[: self.n] = w.ravel()
+            self._openings.mult(x, opening)
+            opened = self.gaps + opening.array_r
+            active = self.tied & self.active | np.where(self.active, lam < 0.0, opened < 0.0)
+            if not reduced(self.comm, int((active != self.active).sum())):
+                break
+            self.active = active
+        return w
+
+    def solve(self, forces: Array, gaps: Array, back: bool = False) -> tuple[Array, Array]:
+        """Displacements ``(n, gdim)`` and multipliers ``(m,)`` by forces and right hand sides of equations, or of the adjoint problem."""
+        b, x = self.matrix.createVecs()
+        b.array[:] = np.concatenate([forces.ravel(), gaps])
+        assert self.ksp is not None
+        (self.ksp.solveTranspose if back else self.ksp.solve)(b, x)
+        if self.ksp.getConvergedReason() < 0:
+            raise LinearSolveError(
+                "the linear problem of a goal's error has no solution: are bodies held, by contact or conditions?"
+            )
+        return np.array(x.array_r[: self.n]).reshape(self.shape), np.array(x.array_r[self.n :])
+
+
+def _factorised(A: PETSc.Mat) -> PETSc.KSP:
+    """A direct solver for a symmetric indefinite matrix that may have null pivots, of redundant equations (collective)."""
+    has = [name for name in ("mumps", "superlu_dist") if PETSc.Sys.hasExternalPackage(name)]
+    if not has:
+        raise MissingBackendError("an estimate of a goal's error needs a direct solver: PETSc with MUMPS or SuperLU_DIST")
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setType("preonly")
+    ksp.setOperators(A)
+    pc = ksp.getPC()
+    pc.setType("lu")
+    pc.setFactorSolverType(has[0])
+    if has[0] == "mumps":
+        pc.setFactorSetUpSolverType()
+        factors = pc.getFactorMatrix()
+        # null pivots are detected; more workspace than estimated, for the zero diagonal
+        factors.setMumpsIcntl(24, 1)
+        factors.setMumpsIcntl(14, 100)
+    ksp.setUp()
+    return ksp
