@@ -62,21 +62,20 @@ class ByError(ByLoad):
 
     def _step(self, done: float, factor: float) -> list[Iteration]:
         """Reach a load factor by two steps, after one has told their error, and commit these (collective)."""
-        problem, progress = self._problem, self._problem.progress
+        problem = self._problem
         problem.set_load(done)
         start = Reached.of(problem)
         self._reach(factor, problem.attempt)
         at_once = Reached.of(problem)
         problem.restore()
-        before, then = Memory.of(problem), (progress.steps, progress.taken, problem._before)
+        before = Memory.of(problem)
         try:
-            first = self._reach(0.5 * (done + factor), problem.solve)
-            progress.steps = then[0]
+            first = self._reach(0.5 * (done + factor), problem.attempt)
+            problem.keep()
             second = self._reach(factor, problem.attempt)
             self._refuse_error(start, at_once, Reached.of(problem), factor - done)
         except BaseException:
             before.put_back(problem)
-            progress.steps, progress.taken, problem._before = then
             raise
         problem.commit()
         return [*first, *second[1:]]
