@@ -31,6 +31,7 @@ from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.norms import Norm
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads, values_at
 from uem_dolfinx.solve.reactions import reactions
+from uem_dolfinx.solve.rigid.rest import converge_or_rest
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress, hold_others
 from uem_dolfinx.solve.taken import taken_by
@@ -344,10 +345,9 @@ class UnitedProblem(given.Sealed):
         self.bodies.wanted[:] = self.bodies.of_owners(ramped(self.load, self.bodies.bcs, start, wanted, fraction))
         try:
             self.bodies.begin_step()
-            history = self.converge(self.bodies, self.system, start, fraction, along)
+            history = converge_or_rest(self, start, fraction, along)
         except UEMError as error:
             stiffness = self.bodies.stiffness
-            self.watch.rigid_sides.advise(error)
             self.restore()
             if isinstance(error, MENDABLE):
                 self.watch.name_corner(stiffness, error)

@@ -54,6 +54,11 @@ class StepControl:
         self.nominal, self._cuts, self._read = nominal, 0, False
 
     @property
+    def cut(self) -> bool:
+        """Whether the present step has been cut."""
+        return self._cuts > 0
+
+    @property
     def length(self) -> float:
         """Length of the next step, if nothing else limits it."""
         return min(self.longest, self.nominal)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import compress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -96,6 +96,10 @@ class Tangent:
         if self._lacks:
             # its diagonal was completed for other conditions
             self._values = None
+
+    def take_points(self, points: Any) -> None:
+        """Replace the loads and springs at nodes; K is assembled anew."""
+        self._points, self._values = points, None
 
     def update(self) -> None:
         """Assemble K if something that it depends on has changed (collective)."""
