@@ -121,6 +121,14 @@ def test_partitions(degree, coupling):
     assert np.allclose(found[0], found[1], rtol=1e-6) and found[0][1] > 0
 
 
+@pytest.mark.parametrize("coupling, finer", [("node_to_surface", 0.5), ("mortar", 1.0)])
+def test_parts_of_cells(coupling, finer):
+    """Parts of the cells, which have no sign, include gaps: what a fine target enters, and where contact begins and ends."""
+    problem, goals = blocks("tilted", 8, 2, coupling, finer)
+    found = uem.goal_error(problem, goals["displacement"])
+    assert COMM.allreduce(found.shares.sum()) > abs(found.error)
+
+
 @pytest.mark.parametrize("degree", [1, slow(2)])
 def test_a_rigid_punch(degree):
     """The same under a rigid target with a sharp corner."""

@@ -40,6 +40,7 @@ class EnrichedRows(NamedTuple):
         gap: parts of the weighted gaps ``(j,)``.
         active: whether the solution's contactors of the rank's own equations are active ``(m,)``.
         tied: whether their equations always are ``(m,)``.
+        own: owned nodes of the enriched space that they belong to ``(m,)``.
         first: first equation of every rank, and one past the last.
     """
 
@@ -50,6 +51,7 @@ class EnrichedRows(NamedTuple):
     gap: Array
     active: Bools
     tied: Bools
+    own: Ints
     first: Ints
 
 
@@ -68,7 +70,8 @@ def enriched_rows(enriched: Enriched) -> EnrichedRows:
         at += count
     active, tied = (np.concatenate([np.zeros(0, bool), *part]) for part in (zip(*states) if states else ([], [])))
     row, node, value, gap_row, gap = (np.concatenate(part) for part in zip(*parts))
-    return EnrichedRows(row, node, value, gap_row, gap, active, tied, first)
+    own = np.concatenate([np.zeros(0, np.int64), *(np.repeat(one.nodes, one.width) for one in surfaces)])
+    return EnrichedRows(row, node, value, gap_row, gap, active, tied, own, first)
 
 
 def _none(gdim: int) -> list[Any]:

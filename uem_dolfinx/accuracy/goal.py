@@ -6,8 +6,9 @@ With the residual r of a solution u in that space, its stiffness K there, and ac
     [ B  0  ] [ . ] = [ -g ]          [ B  0  ]  [ . ] = [   0   ]
 
 w leads to the solution of one degree more, in which contactors become active and are released as in the first one. So ``J'(w)``
-estimates the error of J [R. Becker, R. Rannacher, Acta Numerica 10 (2001) 1-102]. The adjoint solution z gives the cells that it comes
-from: with its part z_h of the solution's own degree, they are those of ``r (z - z_h)``, where r includes the contact tractions.
+estimates the error of J [R. Becker, R. Rannacher, Acta Numerica 10 (2001) 1-102]. The adjoint solution z gives the cells that it
+comes from: with its part z_h of the solution's own degree, they are those of ``r (z - z_h)``, where r includes the contact tractions, and
+those of the gaps times the adjoint pressures.
 """
 
 from __future__ import annotations
@@ -100,14 +101,17 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
         system = _System(enriched, rows)
         error = reduced(config.comm, float((of_u * system.correction(-enriched.forces)).sum()))
         z = fem.Function(enriched.W)
-        z.x.array[: of_u.size] = system.solve(of_u, np.zeros(len(system.gaps)), back=True)[0].ravel()
+        solution, pressures = system.solve(of_u, np.zeros(len(system.gaps)), back=True)
+        z.x.array[: of_u.size] = solution.ravel()
         z.x.scatter_forward()
         system.close()
         z_h, again = fem.Function(config.V), fem.Function(enriched.W)
         z_h.interpolate(z)
         again.interpolate(z_h)
         away = (z.x.array - again.x.array)[: of_u.size].reshape(of_u.shape)
-        shares = enriched.of_cells(np.abs((enriched.residual * away).sum(axis=1)))
+        of_nodes = np.abs((enriched.residual * away).sum(axis=1))
+        np.add.at(of_nodes, rows.own, np.abs(pressures * np.where(system.active, system.gaps, 0.0)))
+        shares = enriched.of_cells(of_nodes)
     cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="goal_error")
     cells.x.array[: len(shares)] = shares
     cells.x.scatter_forward()
