@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from inspect import signature
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from friction_scenes import driven, history
-from helpers import highest, refused
+from helpers import blocks, highest, refused
 
 import uem_dolfinx as uem
 
@@ -85,6 +87,23 @@ def test_what_a_contact_has_not():
     for one in (contact, new):
         for name in ("mu", "offsets", "frictions"):
             refused(uem.InputError, f"no '{name}'", lambda: setattr(one, name, 0.1))
+
+
+LAWS_WITHOUT_FRICTION = {"normal": uem.SoftContact(lambda g: 0.0 * g), "cohesion": uem.Adhesion(1.0, 1.0), "tied": True}
+
+
+@pytest.mark.parametrize("word", LAWS_WITHOUT_FRICTION)
+def test_friction_set_later_is_refused_as_at_once(word):
+    """Friction that does not go with a law is refused when it is set before the problem is made, too, and leaves nothing behind."""
+    b = blocks(MPI.COMM_WORLD, "quadrilateral", 2, 3)
+    how = {word: LAWS_WITHOUT_FRICTION[word]}
+    for value in (0.3, uem.Coulomb(0.3), lambda x: 0.0 * x[0]):
+        refused(uem.InputError, "friction", lambda v=value: uem.Contact(b.high, b.low, friction=v, **how))
+        contact = uem.Contact(b.high, b.low, **how)
+        refused(uem.InputError, "friction", lambda c=contact, v=value: setattr(c, "friction", v))
+        assert contact.friction == 0.0
+    if word == "tied":
+        refused(uem.InputError, "offset", lambda: setattr(contact, "offset", 0.1))
 
 
 #: Values other than the defaults of the arguments for single contacts; ``leak`` is not looked at.

@@ -154,7 +154,8 @@ class Discs:
         (u, one), (v, other) = found
         assert [(time, active) for time, _, active in one] == [(time, active) for time, _, active in other]
         assert all(abs(a - b) <= 1 for (_, a, _), (_, b, _) in zip(one, other)) and max(n for _, _, n in one) >= 2
-        close(u, v)
+        # as accurate as steps of rtol 1e-11 are, since either solves for other contactors on arrays
+        close(u, v, 10.0)
 
     def problem(self, contacts):
         V, u = self.b.V, fem.Function(self.b.V)

@@ -21,6 +21,7 @@ from uem_dolfinx.contact.laws.law import (
     given_friction,
     given_joint,
     given_normal,
+    given_together,
     is_read_again,
     of_rate,
     parameters,
@@ -154,18 +155,15 @@ class Contact(WatchedContact, given.Sealed):
                 coupling = given.word("coupling", coupling, COUPLINGS)
             sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))
             normals = given.word("normals", normals, ("facet", "averaged"))
-            if max_penetration is not None:
-                max_penetration = given.number("max_penetration", max_penetration, BOUND)
-            if thickness is not None:
-                thickness = given.number("thickness", thickness, THICKNESS)
+            max_penetration = None if max_penetration is None else given.number("max_penetration", max_penetration, BOUND)
+            thickness = None if thickness is None else given.number("thickness", thickness, THICKNESS)
             self.corners, chords = given.flag("corners", corners), given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
             self.heats = conductances_of(heat)
             self.normal = given_normal(normal, friction, wear, self.heats, tied)
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, AFTER) if isinstance(tied, str) else given.flag("tied", tied)
-            if not isinstance(adjust, (bool, np.bool_)):
-                adjust = given.number("adjust", adjust, REACH)
+            adjust = adjust if isinstance(adjust, (bool, np.bool_)) else given.number("adjust", adjust, REACH)
             self._offset = given_field("offset", offset)
             self.cohesion, self.leak = given_joint(cohesion, leak, sliding, normal, friction, wear, self.heats, tied, offset)
             if coupling == "mortar" and (chords or normals != "facet"):
@@ -214,7 +212,7 @@ class Contact(WatchedContact, given.Sealed):
     @friction.setter
     def friction(self, value: Field | FrictionLaw) -> None:
         if not self.taken:
-            self._friction = given_friction(value)
+            self._friction = given_together(self, given_friction(value), self._offset)[0]
             return
         before = as_law(self._friction)
         with agreed(self.config.comm):
@@ -284,7 +282,7 @@ class Contact(WatchedContact, given.Sealed):
     @offset.setter
     def offset(self, value: Field) -> None:
         if not self.taken:
-            self._offset = given_field("offset", value)
+            self._offset = given_together(self, self._friction, given_field("offset", value))[1]
             return
         with agreed(self.config.comm):
             value = given_field("offset", value)

@@ -167,6 +167,14 @@ def given_joint(
     return given_cohesion(cohesion, sliding, normal, friction, wear, heats, tied), given_leak(leak, normal, cohesion, tied)
 
 
+def given_together(contact: Any, friction: Any, offset: Any) -> tuple[Any, Any]:
+    """Friction and offset that a contact is given later, checked with what it was made with as if they had been given then."""
+    given_normal(contact.normal, friction, contact._wear, contact.heats, contact.tied)
+    cohesion, leak, of = contact.cohesion, contact.leak, (contact.sliding, contact.normal)
+    given_joint(cohesion, leak, *of, friction, contact._wear, contact.heats, contact.tied, offset)
+    return friction, offset
+
+
 def check_tied(tied: Any, offset: Any, wear: Any, friction: Any) -> None:
     """Refuse what does not go with ``tied = True``.
 
