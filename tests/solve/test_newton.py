@@ -85,6 +85,18 @@ def test_the_last_solve_is_as_accurate_as_convergence_asks(rtol):
     assert 4e-3 < np.median(left) < 5e-2
 
 
+def test_a_solve_that_another_follows_is_coarse():
+    """At small strain the first solve of a nonlinear problem leaves its own accuracy, and no less."""
+    left = []
+    for n in (4, 5, 6, 7, 8, 9):
+        b = blocks(COMM, "triangle", n, n, gap=0.5)
+        F = st_venant(b.u, 1.0) + 1e-7 * ufl.TestFunction(b.V)[0] * ufl.dx
+        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top)]
+        problem = uem.UnitedProblem(F, b.u, bcs=bcs, petsc_options={"ksp_type": "cg", "pc_type": "jacobi"}, rtol=1e-8)
+        left.append(problem.solve()[1].residual)
+    assert 5e-6 < np.median(left) < 5e-5
+
+
 def test_modified_newton_gives_the_same_state():
     answers = {}
     for newton in ("full", "modified"):

@@ -113,7 +113,7 @@ class Exchanges:
     def begin(self) -> None:
         """Begin another linearised problem."""
         self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
-        self._number, self._alone, self._rule = 0, 0, Rule.ALL
+        self._number, self._alone, self._rule, self._on_arrays = 0, 0, Rule.ALL, False
         #: Whether limits are and have been fixed, and the last states without a mechanism.
         self.held = self._were_held = False
         self._known: list[tuple[PairState, Pivot] | None] | None = None
@@ -126,14 +126,20 @@ class Exchanges:
     def take_long(self, violated: Sequence[Violations], cheap: bool) -> bool:
         """Whether the problem is now to be solved on arrays, which counts as an exchange (collective).
 
+        It is not if contactors touch that have no rows yet: arrays hold those with rows alone.
+
         Args:
             violated: violations of every pair.
             cheap: whether an exchange needs no factorisation.
         """
-        made = self._number == (AS_LONG_IF_CHEAP if cheap else 0) and not (self.held or self._were_held or self.frozen)
-        if not made or not count(self._pairs, violated):
+        made = self._number >= (AS_LONG_IF_CHEAP if cheap else 0) and not (self.held or self._were_held or self.frozen)
+        if self._on_arrays or not made or not self._pairs:
             return False
-        self._number, self._pivoting = self._number + 1, Pivoting()
+        new = sum(int((w.enter & ~pair.reserved).sum()) for w, pair in zip(violated, self._pairs))
+        number, new = reduced(self._pairs[0].config.comm, np.array([sum(w.count for w in violated), new]))
+        if not number or new:
+            return False
+        self._number, self._pivoting, self._on_arrays = self._number + 1, Pivoting(), True
         return True
 
     def choose(
