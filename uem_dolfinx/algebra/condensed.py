@@ -16,7 +16,7 @@ the forces on I. Other increments e_C under the same forces need dense algebra o
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -36,18 +36,17 @@ from uem_dolfinx.parallel import on_root, reduced
 FOR_EACH_UNKNOWN = 30_000
 
 
-class Solved(NamedTuple):
+class Solved:
     """The solution of a constrained problem.
 
-    Attributes:
+    Args:
         du: increment of the bodies.
         negative: whether the constrained matrix has a negative determinant.
         indefinite: whether it is symmetric, and has negative eigenvalues.
     """
 
-    du: PETSc.Vec
-    negative: bool
-    indefinite: bool
+    def __init__(self, du: PETSc.Vec, negative: bool, indefinite: bool):
+        self.du, self.negative, self.indefinite = du, negative, indefinite
 
 
 class Condensed:

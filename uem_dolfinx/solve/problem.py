@@ -31,7 +31,6 @@ from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.norms import Norm
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads, values_at
 from uem_dolfinx.solve.reactions import reactions
-from uem_dolfinx.solve.rigid.rest import converge_or_rest
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress, hold_others
 from uem_dolfinx.solve.taken import taken_by
@@ -135,9 +134,8 @@ class UnitedProblem(given.Sealed):
             checks.check_residual(F, u)
             self.load = check_load(load)
             bcs = checks.check_conditions(self.config, bcs)
-            contacts = given.items(
-                "contacts", contacts, lambda one: isinstance(one, Contact | GeneralContact), "a Contact or a GeneralContact"
-            )
+            kinds = Contact | GeneralContact
+            contacts = given.items("contacts", contacts, lambda one: isinstance(one, kinds), "a Contact or a GeneralContact")
             check_new(contacts)
             what = "an Equation, or what periodic returns"
             equations = given.items("equations", equations, lambda one: hasattr(one, "n_values"), what)
@@ -334,6 +332,8 @@ class UnitedProblem(given.Sealed):
             ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, ConflictError, FloatingBodyError,
             TunnellingError, UserFunctionError: after the committed state has been restored.
         """
+        from uem_dolfinx.solve.rigid.rest import converge_or_rest
+
         for pair in self.interfaces:
             check_moved(pair)
         self.led = start, fraction, along is not None

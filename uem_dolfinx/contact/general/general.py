@@ -19,12 +19,6 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, COUPLINGS, MAX_PENETRATION, Contact
-from uem_dolfinx.contact.general.given_laws import (
-    given_edges,
-    refuse_distant_pressures,
-    refuse_open_conductance,
-    refuse_words_of_contact,
-)
 from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
 from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
@@ -100,6 +94,8 @@ class GeneralContact(OfProblem, given.Sealed):
         edges: bool | None = None,
         **others: Any,
     ):
+        from uem_dolfinx.contact.general.given_laws import given_edges, refuse_words_of_contact
+
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
             refuse_words_of_contact(others)
             rigid = [rigid] if hasattr(rigid, "project") else rigid
@@ -178,6 +174,8 @@ class GeneralContact(OfProblem, given.Sealed):
                 f"{self.name}: there is one body and no rigid surface: give rigid=..., or self_contact=True for a body that touches "
                 "itself"
             )
+        from uem_dolfinx.contact.general.given_laws import refuse_distant_pressures, refuse_open_conductance
+
         refuse_open_conductance(config, self.name, self.heats, bound)
         refuse_distant_pressures(config, self.name, self.normal, skin)
         parts: list[Contact] = []

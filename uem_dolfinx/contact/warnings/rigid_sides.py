@@ -38,9 +38,7 @@ class RigidSides:
     """
 
     def __init__(self, contacts: Sequence[Any], couplings: Sequence[RigidCoupling]):
-        self._contacts: list[OfBothSides] = list(contacts) if couplings else []
-        if not self._contacts:
-            return
+        self._contacts: list[OfBothSides] = list(contacts)
         self._rigid: Bools = np.zeros(self._contacts[0].config.n_owned, dtype=bool)
         for coupling in couplings:
             coupling.mark(self._contacts[0].config, self._rigid)

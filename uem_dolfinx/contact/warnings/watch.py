@@ -12,7 +12,6 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.both_sides import OfBothSides
 from uem_dolfinx.contact.warnings.checks import sagging, warn_of_sagging_facets, warn_of_slipped
-from uem_dolfinx.contact.warnings.rigid_sides import RigidSides
 from uem_dolfinx.errors import OrientationError, UEMError
 from uem_dolfinx.geometry.facets import facets_of
 from uem_dolfinx.geometry.tags import Tag
@@ -127,8 +126,12 @@ class Watch:
 
     def __init__(self, contacts: Sequence[WatchedContact], couplings: Sequence[RigidCoupling] = ()):
         self._contacts = contacts
-        #: Contactors that couplings make rigid.
-        self.rigid_sides = RigidSides(contacts, couplings)
+        #: Contactors that couplings make rigid, a ``RigidSides``; None without couplings.
+        self._rigid_sides: Any = None
+        if contacts and couplings:
+            from uem_dolfinx.contact.warnings.rigid_sides import RigidSides
+
+            self._rigid_sides = RigidSides(contacts, couplings)
         if contacts and contacts[0].config.equations:
             from uem_dolfinx.contact.warnings.seams import warn_of_seams
 
@@ -221,6 +224,11 @@ class Watch:
             of_group = corners.find(stiffness, np.array([id(c) in checked for c in group]))
             found |= {group[k]: corner for k, corner in of_group.items()}
         return found
+
+    def advise(self, error: UEMError) -> None:
+        """Add advice to an error if rigid contactors have caused it (collective)."""
+        if self._rigid_sides is not None:
+            self._rigid_sides.advise(error)
 
     def name_corner(self, stiffness: Array | None, error: UEMError) -> None:
         """Add a convex target corner inside contactors to an error message, if there is one (collective).

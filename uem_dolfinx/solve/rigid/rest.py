@@ -92,7 +92,7 @@ def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any) ->
     try:
         return converge()
     except (ConvergenceError, FloatingBodyError) as error:
-        problem.watch.rigid_sides.advise(error)
+        problem.watch.advise(error)
         history = _rest(problem, converge) if along is None and _may_rest(problem) else None
         if history is None:
             raise error

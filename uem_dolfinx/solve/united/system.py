@@ -12,7 +12,6 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
-from uem_dolfinx.algebra.condensed import Solved
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
@@ -34,6 +33,7 @@ from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, IterationS
 from uem_dolfinx.solve.united.rows import BodyState, OverConstraints, Rows, make_rows
 
 if TYPE_CHECKING:
+    from uem_dolfinx.algebra.condensed import Solved
     from uem_dolfinx.conditions.user_rows import UserRows
     from uem_dolfinx.contact.thermal.heat import Heat
 
