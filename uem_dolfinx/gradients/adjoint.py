@@ -14,7 +14,7 @@ from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.form_checks import Control
-from uem_dolfinx.gradients.contact_fields import by_contacts
+from uem_dolfinx.gradients.contact_fields import by_contacts, fields_of
 from uem_dolfinx.gradients.linearised import Linearised
 from uem_dolfinx.gradients.parameters import ContactParameter
 from uem_dolfinx.parallel import reduced
@@ -112,8 +112,9 @@ class Adjoint:
         which = self.at.prescribed_by(m, np.arange(1.0, len(m.x.array) + 1))
         own = which > 0.5
         np.add.at(added.x.array, np.rint(which[own]).astype(np.int64) - 1, (self.at.ramp * self.by_values)[own])
-        entries, values = by_contacts(self.at, m, self.by_gaps, self._at_nodes)
-        np.add.at(added.x.array, entries, values)
+        if any(m is one for one in fields_of(self.at.problem)):
+            entries, values = by_contacts(self.at, m, self.by_gaps, self._at_nodes)
+            np.add.at(added.x.array, entries, values)
         forms.sum_ghosts(added)
         found.x.array[:] += added.x.array
         return found

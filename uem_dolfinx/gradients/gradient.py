@@ -17,6 +17,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.laws.law import is_of_position
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.errors import InputError, InputTypeError
@@ -400,10 +401,7 @@ def _check_shape(problem: UnitedProblem) -> None:
                     "expected coupling='node_to_surface', or tetrahedra"
                 )
     refuse_shape(problem)
-    if any(
-        contact.adjust or (callable(contact.offset) and not isinstance(contact.offset, fem.Function))
-        for contact in problem.contacts
-    ):
+    if any(contact.adjust or is_of_position(contact.offset) for contact in problem.contacts):
         raise InputError(
             "a gradient by the shape needs an offset that is a number or a Function, and no adjust: others change with the shape"
         )

@@ -20,7 +20,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.laws.coulomb import Coulomb
-from uem_dolfinx.contact.laws.law import as_law, follows_load
+from uem_dolfinx.contact.laws.law import as_law, follows_load, is_of_position
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_functional
@@ -224,8 +224,7 @@ class History(given.Sealed):
         load = problem.load if isinstance(problem.load, Mapping) else {}
         density = None if dynamics is None else dynamics.mass.density
         made_of = [] if density is None else list(traverse_unique_terminals(density))
-        fields = {c.name: as_law(c.friction).field for c in problem.contacts if c.pair.frictional}
-        varied = [name for name, f in fields.items() if callable(f) and not isinstance(f, fem.Function)]
+        varied = [c.name for c in problem.contacts if c.pair.frictional and is_of_position(as_law(c.friction).field)]
         with agreed(problem.comm):
             refuse_kept_projections(problem, len(self))
             for k, m in enumerate(controls):

@@ -201,6 +201,11 @@ def parameters(law: FrictionLaw) -> list[Any]:
     return [law.field, *others]
 
 
+def is_of_position(field: Field) -> bool:
+    """Whether a field is a function of position, whose values at nodes change where these are moved; a Function goes with its nodes."""
+    return callable(field) and not isinstance(field, fem.Function)
+
+
 def is_read_again(law: FrictionLaw) -> bool:
     """Whether the law's parameter is read at every step: it follows the load, or is a Function, whose values may have changed."""
     return isinstance(law.field, fem.Function) or follows_load(law)
@@ -251,7 +256,7 @@ def values_at(
         return np.full(n, law.field) if law.field > 0 else None
     words, more = f"contact '{name}': friction", ((at,) if T is None else (at, T)) if follows_load(law) else ()
     value = asked_at(config, nodes, words, law.field, given.NOT_NEGATIVE, *more)
-    return value if is_read_again(law) or reduced(config.comm, int((value > 0).any())) else None
+    return value if more or isinstance(law.field, fem.Function) or reduced(config.comm, int((value > 0).any())) else None
 
 
 def asked_at(

@@ -166,7 +166,6 @@ def _dragged(problem: Any, drag: _Drag) -> Iterator[None]:
     try:
         floating.motions = None
         bodies.points = drag  # type: ignore[assignment]
-        bodies.tangent.take_points(drag)
         yield
     finally:
         floating.motions, bodies.points = motions, points
