@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 from body_scenes import surface_of
 from dolfinx import fem
@@ -20,22 +21,35 @@ WORDS = "the contactor is rigid and finer than its target"
 ADVICE = "make the rigid surface the target"
 
 
-def punch_on_block(cell, across, *, rigid_first, coupling="mortar", degree=1, rigid=True, half=0.4):
-    """A punch with facets of a given part of the block's, pressed by 0.05 onto a block of one unit in height."""
+def punch_on_block(
+    cell, across, *, rigid_first=None, coupling="mortar", degree=1, rigid=True, held=False, half=0.4, turned=False
+):
+    """A punch with facets of a given part of the block's, on a block of one unit in height: pressed by 0.05, or held 0.03 lower.
+
+    ``rigid_first=None`` is general contact; ``turned`` exchanges the bodies' places in the mesh.
+    """
     g = 2 if cell in ("quadrilateral", "triangle") else 3
     wide, fine = ([20] if g == 2 else [8, 8]), ([8] if g == 2 else [3, 3])
     low = box(cell, [-1.0] * (g - 1) + [0.0], [1.0] * g, [*wide, 4])
     high = box(cell, [-half] * (g - 1) + [1.0], [half] * (g - 1) + [1.5], [*(round(n / across) for n in fine), 2])
-    s = scene(COMM, cell, [low, high])
+    s, block, head = scene(COMM, cell, [high, low] if turned else [low, high]), int(turned), int(not turned)
     u = fem.Function(compat.function_space(s.mesh, degree, (g,)))
-    base, top, foot = s.tag("base", 0, at(g - 1, 0.0)), s.tag("top", 0, at(g - 1, 1.0)), s.tag("foot", 1, at(g - 1, 1.0))
-    force = [0.0] * (g - 1) + [-0.05]
-    punch = uem.RigidCoupling(
-        surface_of(s, 1) if rigid else s.tag("lid", 1, at(g - 1, 1.5)), [0.0] * (g - 1) + [1.5], force=force
+    base, top, foot = (
+        s.tag("base", block, at(g - 1, 0.0)),
+        s.tag("top", block, at(g - 1, 1.0)),
+        s.tag("foot", head, at(g - 1, 1.0)),
     )
-    contact = uem.Contact(*((foot, top) if rigid_first else (top, foot)), coupling=coupling)
-    problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=clamp(u.function_space, base), contacts=[contact], couplings=[punch])
-    return problem, contact
+    down, part = [0.0] * (g - 1), surface_of(s, head) if rigid else s.tag("lid", head, at(g - 1, 1.5))
+    if held:
+        punch, bcs = [], clamp(u.function_space, part, value=[*down, -0.03])
+    else:
+        punch, bcs = [uem.RigidCoupling(part, [*down, 1.5], force=[*down, -0.05])], []
+    bcs += clamp(u.function_space, base)
+    if rigid_first is None:
+        contact = uem.GeneralContact(coupling=coupling, bodies={"block": base, "punch": foot})
+    else:
+        contact = uem.Contact(*((foot, top) if rigid_first else (top, foot)), coupling=coupling)
+    return uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact], couplings=punch), contact
 
 
 def warned(caplog):
@@ -46,16 +60,33 @@ def warned(caplog):
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "triangle", "hexahedron"])
-def test_a_fine_rigid_contactor_is_named(caplog, cell, coupling, degree):
+@pytest.mark.parametrize("held", [False, True])
+def test_a_fine_rigid_contactor_is_named(caplog, held, cell, coupling, degree):
     """Once, before any work; the same scene the other way round is silent and carries the force in a few iterations."""
-    punch_on_block(cell, 0.5, rigid_first=True, coupling=coupling, degree=degree)
+    punch_on_block(cell, 0.5, rigid_first=True, coupling=coupling, degree=degree, held=held)
     assert warned(caplog) == 1
-    problem, contact = punch_on_block(cell, 0.5, rigid_first=False, coupling=coupling, degree=degree)
+    problem, contact = punch_on_block(cell, 0.5, rigid_first=False, coupling=coupling, degree=degree, held=held)
     assert warned(caplog) == 1
     if cell == "quadrilateral":
         (step,) = run(problem)
         assert len(step.iterations) - 1 <= 6
-        assert contact.resultant().force[1] == pytest.approx(-0.05, rel=1e-6)
+        if not held:
+            assert contact.resultant().force[1] == pytest.approx(-0.05, rel=1e-6)
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("held", [False, True])
+def test_in_general_contact_the_deformable_body_follows(caplog, held, coupling):
+    """Whichever is finer and whichever comes first in the mesh; forces are those of the contact declared that way, but for corners."""
+    problem, declared = punch_on_block("quadrilateral", 0.5, rigid_first=False, coupling=coupling, held=held)
+    run(problem)
+    want = declared.resultant().force[1]
+    for turned in (False, True):
+        problem, contact = punch_on_block("quadrilateral", 0.5, coupling=coupling, held=held, turned=turned)
+        run(problem)
+        force = contact.between("block", "punch").force
+        assert np.linalg.norm(force - [0.0, want]) <= (3e-3 if held and coupling == "node_to_surface" else 1e-6) * abs(want)
+    assert warned(caplog) == 0
 
 
 def test_equal_facets(caplog):
@@ -63,6 +94,7 @@ def test_equal_facets(caplog):
     for across, half in ((1.0, 0.4), (1.0, 0.39992), (2.0, 0.4)):
         punch_on_block("quadrilateral", across, rigid_first=True, half=half)
     punch_on_block("quadrilateral", 0.5, rigid_first=True, rigid=False)
+    punch_on_block("quadrilateral", 0.5, rigid_first=True, rigid=False, held=True)
     assert warned(caplog) == 0
     for number, (across, half) in enumerate(((1.0, 0.398), (0.8, 0.4)), 1):
         punch_on_block("quadrilateral", across, rigid_first=True, half=half)
@@ -70,10 +102,11 @@ def test_equal_facets(caplog):
 
 
 @slow
+@pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
-def test_the_error_says_what_helps(coupling):
+def test_the_error_says_what_helps(coupling, held):
     """The active set of dependent equations cycles; the error advises to exchange the surfaces, not to refine the target."""
-    problem, _ = punch_on_block("quadrilateral", 0.5, rigid_first=True, coupling=coupling)
+    problem, _ = punch_on_block("quadrilateral", 0.5, rigid_first=True, coupling=coupling, held=held)
     with pytest.raises(uem.ConvergenceError, match=ADVICE) as caught:
         run(problem)
     assert "finer facets" not in str(caught.value)

@@ -17,7 +17,7 @@ from ufl.constantvalue import ScalarValue
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
@@ -87,6 +87,14 @@ def check_couplings(couplings: Any) -> tuple[list[RigidCoupling], list[Any]]:
     )
     rigid = [one for one in found if not hasattr(one, "ends")]
     return rigid, rigid + [one for one in found if hasattr(one, "ends")]
+
+
+def rigid_nodes(config: Configuration, free: Bools, couplings: Sequence[RigidCoupling]) -> Bools:
+    """Owned nodes ``(n_owned,)`` that couplings, or conditions of all components, ``~free (n_owned, gdim)``, move (collective)."""
+    rigid = np.asarray(~free.any(axis=1))
+    for coupling in couplings:
+        coupling.mark(config, rigid)
+    return rigid
 
 
 def check_checkpoint(checkpoint: Any) -> None:

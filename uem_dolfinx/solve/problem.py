@@ -176,7 +176,6 @@ class UnitedProblem(given.Sealed):
         self.declared: list[Contact | GeneralContact] = contacts
         #: Other declared objects: ties of a scalar field, linear equations, couplings, and loads and springs at points.
         self.ties, self.equations, self.couplings, self.points = ties, equations, couplings, points
-        self.contacts: list[Contact] = parts_of(contacts, self.config, couplings)
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
             checks.check_residual(damping, u, "the damping form")
@@ -200,9 +199,10 @@ class UnitedProblem(given.Sealed):
             add_masses(couplings, dynamics)
         self.solver = solver_of(self.config, petsc_options_prefix, petsc_options)
         free = self.bodies.free[: self.config.n_owned]
+        rigid = checks.rigid_nodes(self.config, free, couplings if contacts else [])
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
         self.config.equations = equations
-        self.contacts = attached(self.contacts, self.config, free, clock)
+        self.contacts: list[Contact] = attached(parts_of(contacts, self.config, rigid), self.config, free, clock)
         if method is BodySystem:
             join_alike(self.contacts)
         if dynamics is not None:
@@ -243,7 +243,7 @@ class UnitedProblem(given.Sealed):
         for contact in self.contacts:
             contact.begin()
         #: Warnings issued during steps.
-        self.watch = Watch(self.contacts, self.couplings)
+        self.watch = Watch(self.contacts, rigid)
         #: Settings of the run, for checkpoints.
         declared = {"equations": equations, "couplings": linked, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in declared.items() if some}

@@ -33,7 +33,6 @@ from uem_dolfinx.geometry.tags import Part, Tag, communicator_of
 from uem_dolfinx.parallel import agreed
 
 if TYPE_CHECKING:
-    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.general.pair_friction import FrictionOfPairs
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.geometry.skin import Apart
@@ -51,7 +50,7 @@ class GeneralContact(OfProblem, given.Sealed):
         exclude: parts without contact, and pairs of parts ``(one, other)`` without contact between them, of facets or of cells.
             Surfaces paired by another ``Contact`` of the problem are left to it; its tied nodes have no contact next to the tie.
         order: parts, of facets or of cells, whose bodies' nodes follow all later ones; other bodies come after these, the finer
-            first, of equally fine ones the smaller, with mortar those that couplings make rigid last.
+            first, of equally fine ones the smaller, those that couplings or Dirichlet conditions make rigid last.
         self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
             order of the mesh's input.
@@ -144,7 +143,7 @@ class GeneralContact(OfProblem, given.Sealed):
         """Name and number of rigid surfaces."""
         return f"GeneralContact({self.name!r}, rigid surfaces: {len(self.rigid)})"
 
-    def make_parts(self, config: Configuration, others: Sequence[Contact], rigid: Bools | None = None) -> list[Contact]:
+    def make_parts(self, config: Configuration, others: Sequence[Contact], rigid: Bools) -> list[Contact]:
         """Make the single contacts of the general contact, in a problem with these ``others`` and ``rigid (n_owned,)`` nodes (collective).
 
         Raises:
@@ -160,7 +159,7 @@ class GeneralContact(OfProblem, given.Sealed):
         pairs += [(c.contactor, c.target) for c in others]
         surface = touching_surface(config, self.surfaces, [as_part(config, part, "exclude") for part in alone])
         self._skin = skin = Skin(config, surface)
-        place = skin.order([as_part(config, part, "order") for part in self.order], rigid if self.coupling == "mortar" else None)
+        place = skin.order([as_part(config, part, "order") for part in self.order], rigid)
         self._name_bodies()
         nodes = surface_nodes(config, surface)
         bound = MAX_PENETRATION * float(skin.extent.min()) if self.max_penetration is None else self.max_penetration
@@ -429,11 +428,7 @@ class GeneralContact(OfProblem, given.Sealed):
         return part.name.removeprefix(f"{self.name} on ")
 
 
-def parts_of(
-    contacts: Sequence[Contact | GeneralContact], config: Configuration, couplings: Sequence[RigidCoupling] = ()
-) -> list[Contact]:
-    """Contacts, with general contacts replaced by their parts, in a problem with these couplings (collective)."""
-    single, rigid = [one for one in contacts if isinstance(one, Contact)], np.zeros(config.n_owned, bool)
-    for coupling in couplings if len(single) < len(contacts) else ():
-        coupling.mark(config, rigid)
+def parts_of(contacts: Sequence[Contact | GeneralContact], config: Configuration, rigid: Bools) -> list[Contact]:
+    """Contacts, with general contacts replaced by their parts, in a problem with these ``rigid (n_owned,)`` nodes (collective)."""
+    single = [one for one in contacts if isinstance(one, Contact)]
     return [part for one in contacts for part in ([one] if isinstance(one, Contact) else one.make_parts(config, single, rigid))]

@@ -7,7 +7,7 @@ depend on each other, the distribution of forces among them is not unique, and t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,27 +21,22 @@ from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
-if TYPE_CHECKING:
-    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
-
 #: Sides of facets whose mean lengths differ by less than this part are equally long.
 #: [convention; length of a side; test_rigid_sides.py::test_equal_facets]
 EQUALLY_LONG = 1e-3
 
 
 class RigidSides:
-    """Nodes of a problem that couplings make rigid, and the contacts that have them as contactors (collective).
+    """Nodes of a problem that couplings or Dirichlet conditions make rigid, and the contacts with such contactors (collective).
 
     Args:
         contacts: of the problem, each with ``contactor``, ``target``, ``name`` and ``pair``.
-        couplings: of the problem.
+        rigid: the nodes ``(n_owned,)``.
     """
 
-    def __init__(self, contacts: Sequence[Any], couplings: Sequence[RigidCoupling]):
+    def __init__(self, contacts: Sequence[Any], rigid: Bools):
         self._contacts: list[OfBothSides] = list(contacts)
-        self._rigid: Bools = np.zeros(self._contacts[0].config.n_owned, dtype=bool)
-        for coupling in couplings:
-            coupling.mark(self._contacts[0].config, self._rigid)
+        self._rigid = rigid
         for contact in contacts:
             self._warn(contact.config, contact)
 

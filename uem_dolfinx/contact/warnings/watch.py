@@ -19,7 +19,6 @@ from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
-    from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.seam.state import PairState
@@ -121,17 +120,17 @@ class Watch:
 
     Args:
         contacts: of the problem, which have begun.
-        couplings: of the problem.
+        rigid: nodes that move as rigid bodies ``(n_owned,)``; None without such nodes.
     """
 
-    def __init__(self, contacts: Sequence[WatchedContact], couplings: Sequence[RigidCoupling] = ()):
+    def __init__(self, contacts: Sequence[WatchedContact], rigid: Bools | None = None):
         self._contacts = contacts
-        #: Contactors that couplings make rigid, a ``RigidSides``; None without couplings.
+        #: Contactors of rigid bodies, a ``RigidSides``; None without rigid nodes.
         self._rigid_sides: Any = None
-        if contacts and couplings:
+        if contacts and rigid is not None and reduced(contacts[0].config.comm, int(rigid.sum())):
             from uem_dolfinx.contact.warnings.rigid_sides import RigidSides
 
-            self._rigid_sides = RigidSides(contacts, couplings)
+            self._rigid_sides = RigidSides(contacts, rigid)
         if contacts and contacts[0].config.equations:
             from uem_dolfinx.contact.warnings.seams import warn_of_seams
 
