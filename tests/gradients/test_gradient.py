@@ -205,7 +205,7 @@ def test_what_is_refused():
         (s.load, 1.0, f"{the_change} = 1.0: expected finite numbers of shape (2,)"),
         (s.E, np.nan, f"{the_change} = nan: expected finite numbers"),
         (s.field, s.u, f"{the_change} is a Function of another space: expected one of the control's space"),
-        (s.X, s.field, f"{the_change} is a Function of another space: expected one of the displacement's space"),
+        (s.X, s.field, f"{the_change} is a Function of another space: expected one of the mesh's nodes' space"),
     ):
         refused(uem.InputError, words, lambda control=control, change=change: uem.tangent(problem, [(control, change)]))
     for control, change, words in (
@@ -287,6 +287,13 @@ def test_by_the_shape_from_a_cold_cache(axisymmetric):
     whole = revolved(J)
     explicit = ufl.derivative(whole, u, du), forms.by_places(whole, mesh, wave(V))
     assert sum(forms.assemble_scalar(forms.form(one), COMM) for one in explicit) == pytest.approx(dot(by, wave(V)), rel=1e-10)
+
+
+@pytest.mark.slow
+def test_the_shape_with_quadratic_tetrahedra():
+    """Nodes in the middle of straight edges move with these."""
+    s = pressed("tetrahedron", 2, law="linear")
+    assert min(orders(s, lambda problem: s.J, "X").values()) >= 1.95
 
 
 def test_parameters_that_have_changed():

@@ -30,7 +30,8 @@ def scene(kind, displacement=0, comm=COMM):
     bcs.append(uem.dirichlet(f.space, b.top, 1, top))
     if kind == "pressure":
         F = with_pressure(f, field * E, 0.4999)
-        controls = {"E": (E, 1.0), "top": (top, 1.0), "field": (field, wave(field.function_space))}
+        shape = wave(uem.function_space(mesh, 1, (2,)), 0.05)
+        controls = {"E": (E, 1.0), "top": (top, 1.0), "field": (field, wave(field.function_space)), "X": (X, shape)}
     else:
         alpha = fem.Constant(mesh, 0.02)
         F = ufl.inner(field * E * (stress(u, 1.0) - alpha * other * ufl.Identity(2)), strain(v)) * ufl.dx
@@ -75,7 +76,7 @@ def changed(s, h):
     kept = [np.array(s.b.scene.mesh.geometry.x)]
     for name, (control, change) in s.controls.items():
         if name == "X":
-            move(s, in_space(s.b.V, change), h)
+            move(s, change, h)
         elif isinstance(control, fem.Function):
             kept.append(np.array(control.x.array))
             control.x.array[:] += h * in_space(control.function_space, change).x.array

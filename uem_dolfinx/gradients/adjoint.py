@@ -120,10 +120,10 @@ class Adjoint:
         return found
 
     def _by_shape(self, X: ufl.SpatialCoordinate) -> fem.Function:
-        """A Function of the displacement's space."""
+        """A Function of the space of the mesh's nodes."""
         found, n = self.at.derivatives.by_places(self.terms, X), len(self._by_places)
         found.x.array[:n] += self._by_places
         for which, slopes in self.at.shape_slopes:
             found.x.array[:n] += slopes.back(self.by_gaps[which], -self._at_nodes).ravel()
         found.x.scatter_forward()
-        return found
+        return self.at.places.back(found)

@@ -14,7 +14,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from uem_dolfinx import compat, given
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import is_of_position
@@ -26,6 +26,7 @@ from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.gradients.assemblies import constants_of
 from uem_dolfinx.gradients.contact_fields import check_field, fields_of
 from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
+from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.refused import refuse_assembly, refuse_parameter, refuse_shape
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
@@ -59,7 +60,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
 
     Returns:
         For every control, in the same order, the derivatives by its entries: an array of the shape of a Constant's value or a parameter,
-        a Function of the control's space, or for the shape a Function of the displacement's space.
+        a Function of the control's space, or for the shape a Function of vectors at the mesh's nodes: of the displacement's space, or for
+        straight cells with a displacement of degree 2 of a vector space of degree 1.
 
     Raises:
         InputError, InputTypeError: if the gradient depends on the history of all steps, if the problem has no step or no consistent
@@ -92,7 +94,7 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]],
     Args:
         problem: as in :func:`gradient`.
         direction: pairs of a control, as in :func:`gradient`, and its change: for a Constant or a parameter of a contact an array of its
-            shape, for a Function a Function of its space, for the shape a Function of the displacement's space.
+            shape, for a Function a Function of its space, for the shape a Function as :func:`gradient` returns it.
         of: the ``pressure`` of a contact of the problem; None for the displacement.
 
     Returns:
@@ -369,7 +371,7 @@ def _check_change(problem: UnitedProblem, what: str, control: AnyControl, change
         if not np.isfinite(values).all():
             raise InputError(given.sentence(what, change, "finite numbers"))
         return
-    of, whose = problem.config.V, "the displacement's"
+    of, whose = Places(problem.config).W, "the mesh's nodes'"
     if isinstance(control, fem.Function):
         of, whose = control.function_space, "the control's"
     given.kind(what, change, isinstance(change, fem.Function), f"a Function of {whose} space")
@@ -381,8 +383,8 @@ def _check_change(problem: UnitedProblem, what: str, control: AnyControl, change
 def _check_shape(problem: UnitedProblem) -> None:
     """Refuse problems that have no gradient by the shape."""
     config = problem.config
-    if compat.geometry_dofs(config.mesh).shape[1] != compat.cell_dofs(config.V).shape[1]:
-        raise InputError("a gradient by the shape needs cells of the displacement's degree: straight ones for degree 1")
+    if not Places(config).known:
+        raise InputError("a gradient by the shape needs straight cells, or cells of the displacement's degree")
     if any(pair.sliding != "finite" for pair in problem.pairs):
         raise InputError(
             "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"

@@ -50,6 +50,7 @@ from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.contact_fields import along_field
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
 from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of, rubbed, thickened, turned_by
+from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
 from uem_dolfinx.gradients.shape_slopes import ShapeSlopes, shape_slopes_of
 from uem_dolfinx.log import logger
@@ -317,6 +318,11 @@ class Linearised:
         return gaps, pushed
 
     @cached_property
+    def places(self) -> Places:
+        """The shape as a control."""
+        return Places(self.config)
+
+    @cached_property
     def shape_slopes(self) -> list[tuple[slice, ShapeSlopes]]:
         """Derivatives of ties and users' equations by positions of nodes, each with its equations (first time: collective)."""
         found = shape_slopes_of(self.problem, self.equations)
@@ -337,7 +343,7 @@ class Linearised:
                     forces.array[: self._n] -= self.share(m) * size * pushed.ravel()
                 continue
             if isinstance(m, ufl.SpatialCoordinate):
-                shape.x.array[:] += values_in(config.V, change)
+                shape.x.array[:] += self.places.at_nodes(change).x.array
                 if (form := forms.by_places(self.F, config.mesh, change)) is not None:
                     forces.array[:] -= self.assembled(form)
                 continue
