@@ -1,4 +1,4 @@
-"""Forces of the bolts of a joint from strains beside them, by exact derivatives through ties, preloads and contact.
+"""Forces of the bolts of a joint from strains next to them, by exact derivatives through ties, preloads and contact.
 
 python3 demos/assembly.py --plot assembly.png
 
@@ -62,7 +62,7 @@ work = {"solves": 0, "tangents": 0}
 
 # %%
 def strains(f: fem.Function) -> np.ndarray:
-    """Vertical strains of a displacement at all gauges, means over cells beside them ``(6,)``."""
+    """Vertical strains of a displacement at all gauges, means over cells next to them ``(6,)``."""
     return np.array([uem.integrate(w * f[2].dx(2) * ufl.dx) / size for w, size in zip(weights, sizes)])
 
 

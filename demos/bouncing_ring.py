@@ -105,6 +105,7 @@ if args.plot:
                 ax.plot(*lines.transpose(2, 1, 0), color=colours(0.9 * time / args.end), lw=1.2)
             ax.axhline(-1.0 - height, color="0.3", lw=2)
             ax.set_aspect("equal")
+            ax.set(xlabel="x", ylabel="y")
             ax.set_title(f"every {every * args.dt:.2g} s, from dark to light")
 
 # %%

@@ -93,8 +93,8 @@ def arguments(docstring: str | None, **options: Any) -> argparse.Namespace:
 def of_sketch(name: str) -> dict[str, Any]:
     """What ``sketches.txt`` says of the sketch of a demo; nothing if it says nothing."""
     lines = (Path(__file__).parent / "sketches.txt").read_text(encoding="utf-8").splitlines()
-    told = dict(line.split(": ", 1) for line in lines if not line.startswith("#"))
-    how = ast.literal_eval(told.get(name, "{}")) or {}
+    lines_of = dict(line.split(": ", 1) for line in lines if not line.startswith("#"))
+    how = ast.literal_eval(lines_of.get(name, "{}")) or {}
     return {key: value for key, value in how.items() if key != "small"}
 
 

@@ -150,7 +150,7 @@ def forget_peak() -> None:
 
 
 def peak() -> float | None:
-    """Peak of the memory of all ranks, in bytes, None where the system does not tell (collective)."""
+    """Peak of the memory of all ranks, in bytes, None where the system does not report it (collective)."""
     try:
         line = next(line for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines() if "VmHWM" in line)
         here = 1024.0 * float(line.split()[1])

@@ -125,11 +125,11 @@ if args.plot:
         if right is not None:
             width = max(len(way) // 150, 1)
             smooth = np.convolve(force, np.ones(width) / width, "valid")
-            right.plot(way[: len(smooth)] + 0.5 * width * (way[1] - way[0]), 1e-3 * smooth, label="force of the press")
+            right.plot(way[: len(smooth)] + 0.5 * width * (way[1] - way[0]), 1e-3 * smooth, label="press")
             right.axhline(1e-3 * mean, color="C0", ls="--", label="mean")
-            right.axhline(1e-3 * published, color="k", lw=1, label="mean, measured (2001)")
+            right.axhline(1e-3 * published, color="k", lw=1, label="mean by the formula")
             right.set(xlabel="stroke / mm", ylabel="force / kN")
-            right.legend(frameon=False)
+            right.legend(frameon=False, ncol=3, columnspacing=1.0, loc="lower center", bbox_to_anchor=(0.5, 1.0))
             right.grid(alpha=0.25)
 
 # %%

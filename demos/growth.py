@@ -22,7 +22,7 @@ Options:
 # |---|---|
 # | collectives | calls in which all ranks meet |
 # | reduced_bytes | in sums and broadcasts, which go over log2 p ranks |
-# | told_bytes | that every rank tells every other: sizes of messages, boxes around surfaces |
+# | gathered_bytes | that every rank sends to every other: sizes of messages, boxes around surfaces |
 # | row_bytes | rows of points, feet, equations and matrices, from the ranks that have them |
 # | sent_bytes | in messages to single ranks: halos of vectors and matrices |
 # | messages | to single ranks, those with rows too |
@@ -93,12 +93,12 @@ common.report(args, {"counts": rows, "stages": stages, "models": models, "paper"
 
 # %% [markdown]
 # ## The picture
-# Bytes that the busiest rank receives for the contact in a linearisation: its own rows, and what every rank tells every other, with as many
-# unknowns a rank; points are counts at the sizes counted.
+# Bytes that the busiest rank receives for the contact in a linearisation, with as many unknowns a rank: its own rows, and data that every
+# rank sends to every other. Points are counts at the sizes counted.
 
 # %%
 with uem.figure(args.plot, comm, panels=2) as panels:
-    for panel, count, label in zip(panels, ("row_bytes", "told_bytes"), ("bytes of rows", "bytes that all tell all")):
+    for panel, count, label in zip(panels, ("row_bytes", "gathered_bytes"), ("bytes of rows", "bytes from all to all")):
         if panel is None:
             continue
         for k, declared in enumerate(scenes):
@@ -109,6 +109,6 @@ with uem.figure(args.plot, comm, panels=2) as panels:
                 ranks = np.geomspace(2, 8000, 60)
                 panel.plot(ranks, [sum(growth.on_paper(model, each * p, p).values()) for p in ranks], "-", lw=1, color=f"C{k}")
         panel.set(xlabel="ranks", ylabel=label)
-        if any(len(line.get_xdata()) for line in panel.lines):  # one rank tells no other anything
+        if any(len(line.get_xdata()) for line in panel.lines):  # a single rank sends nothing
             panel.set(xscale="log", yscale="log")
             panel.legend(frameon=False)

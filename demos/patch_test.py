@@ -136,7 +136,7 @@ if args.coupling == "node_to_surface":
 # ## The cases of mortar
 # Meshes n:m that are not nested; nodes moved at random; a wider lower block, whose contact ends within a facet and covers a part
 # of it, or only a hundredth; and each side once as contactor. In 3D the wider block is of hexahedra. Uniting in integrals does
-# not spoil the condition of the system: beside it is the largest eigenvalue of the bodies without contact over the smallest of
+# not spoil the condition of the system: it is compared with the largest eigenvalue of the bodies without contact over the smallest of
 # one body of their shape, with the finer cells.
 
 # %%

@@ -145,7 +145,7 @@ def count(dofs: int) -> dict[str, object]:
 # %% [markdown]
 # ## On paper: a thousand ranks
 # Bytes that go with a rank's own contactors and facets are those of the most ranks that were measured, as many for each; bytes that
-# every rank tells every other are as many for each pair.
+# every rank sends to every other are as many for each pair.
 
 
 # %%

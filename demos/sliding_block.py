@@ -16,7 +16,7 @@ Options:
 # - *driven* by its tail it sticks first, then slips from the tail to the front, and at last everywhere: H = mu N, and from there on
 #   friction takes the energy H d over a way d;
 # - *pushed* by a force it stays up to mu N, to either side; on an *incline* it stays up to tan(alpha) = mu. Weight, push and friction are
-#   in balance. Beyond, there is no equilibrium, which a `FrictionError` tells;
+#   in balance. Beyond, there is no equilibrium, and a `FrictionError` is raised;
 # - *thrown* with the velocity v it stops after the way v^2 / (2 mu g).
 #
 # No contactor that sticks moves along the base: stick is exact, without penalty.

@@ -21,8 +21,9 @@ Options:
 #     P = E h^3 d / (4 l^3),   slope 3 d / (2 l),  stress 3 E h d / (2 l^2)
 #     P = E h0^3 d / (8 l^3),  slope 3 d / l,      stress 3 E h0 d / (4 l^2)
 #
-# The force of insertion is `P tan(angle of the ramp + slope)`, which tells h0. Unknowns are thicknesses at knots; of the stress along the
-# upper side a norm of high power is taken. The gradients of both take an adjoint problem each (`uem.gradient`), by the places of all nodes.
+# The force of insertion is `P tan(angle of the ramp + slope)`, which determines h0. Unknowns are thicknesses at knots; of the stress
+# along the upper side a norm of high power is taken. The gradients of both take an adjoint problem each (`uem.gradient`), by the places
+# of all nodes.
 
 # %%
 import functools

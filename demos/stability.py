@@ -43,9 +43,9 @@ from benchmarks.every_case import CASES
 import uem_dolfinx as uem
 
 args = common.arguments(__doc__, quick=False, methods="all", cases="all", known="")
-asked, picked = args.methods.split(","), args.cases.split(",")
+chosen, picked = args.methods.split(","), args.cases.split(",")
 COLUMN_NAMES = [column.name for column in COLUMNS]
-columns = [c for c in COLUMNS if args.methods == "all" or c.name in asked or c.method in asked]
+columns = [c for c in COLUMNS if args.methods == "all" or c.name in chosen or c.method in chosen]
 rows = [c for c in CASES if (args.cases == "all" and (c.quick or not args.quick)) or c.name in picked]
 if not columns or not rows:
     sys.exit(f"nothing to do: --methods are {', '.join(COLUMN_NAMES)}; --cases are {', '.join(c.name for c in CASES)}")
@@ -168,8 +168,8 @@ if args.plot:
             for spine in ax.spines.values():
                 spine.set_visible(False)
     path = Path(args.plot)
-    beside = path.with_name(f"{path.stem}_condition{path.suffix}")
-    with uem.figure(beside if curves else None, comm, panels=3, size=(3.3, 3.9)) as panels:
+    conditions = path.with_name(f"{path.stem}_condition{path.suffix}")
+    with uem.figure(conditions if curves else None, comm, panels=3, size=(3.3, 3.9)) as panels:
         if panels[0] is not None:
             labels = {
                 "ratio": "upper over lower Young's modulus",

@@ -73,9 +73,9 @@ start = time.perf_counter()
 runpy.run_path(script, run_name="__main__")
 wall = time.perf_counter() - start
 import uem_dolfinx
-told = {t: uem_dolfinx.timing(t) for t in json.loads(timers)}
+measured = {t: uem_dolfinx.timing(t) for t in json.loads(timers)}
 with open(file, "w", encoding="utf-8") as out:
-    json.dump({"timers": told, "wall": wall, "counts": counts}, out)
+    json.dump({"timers": measured, "wall": wall, "counts": counts}, out)
 """
 
 # %% [markdown]
@@ -106,12 +106,12 @@ def run(name: str, options: list[str]) -> tuple[dict[str, int], dict[str, float]
         done = subprocess.run(command, cwd=folder, env=common.outside_mpi(), capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"{name} {' '.join(options)} failed:\n{done.stdout[-2000:]}{done.stderr[-4000:]}")
-        told = json.loads(file.read_text(encoding="utf-8"))
+        measured = json.loads(file.read_text(encoding="utf-8"))
     if args.verbose:
-        print(f"{name} {' '.join(options)}: {told['wall']:.1f} s", flush=True)
-    calls = {stage: sum(told["timers"][timer][0] for timer in timers) for stage, timers in STAGES.items()}
-    seconds = {stage: sum(told["timers"][timer][1] for timer in timers) for stage, timers in STAGES.items()}
-    return calls, seconds | {"wall": told["wall"]}, told["counts"] | {"factorisations": calls["factorisation"]}
+        print(f"{name} {' '.join(options)}: {measured['wall']:.1f} s", flush=True)
+    calls = {stage: sum(measured["timers"][timer][0] for timer in timers) for stage, timers in STAGES.items()}
+    seconds = {stage: sum(measured["timers"][timer][1] for timer in timers) for stage, timers in STAGES.items()}
+    return calls, seconds | {"wall": measured["wall"]}, measured["counts"] | {"factorisations": calls["factorisation"]}
 
 
 # %%

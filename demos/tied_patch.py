@@ -61,8 +61,8 @@ def patch(dim: int, degree: int, cells: tuple[int, int], quads: int, moved: floa
         uem.interpolate(s, stress_of(field))
     found = [(u.x.array, exact.x.array), tuple(s.x.array for s in stress)]
     return max(
-        max(comm.allgather(np.abs(got - told).max(initial=0.0))) / max(comm.allgather(np.abs(told).max(initial=0.0)))
-        for got, told in found
+        max(comm.allgather(np.abs(got - expected).max(initial=0.0))) / max(comm.allgather(np.abs(expected).max(initial=0.0)))
+        for got, expected in found
     )
 
 

@@ -64,7 +64,7 @@ except ImportError as _error:
     from uem_dolfinx.errors import MissingBackendError
 
     raise MissingBackendError(
-        f"uem_dolfinx needs mpi4py and DOLFINx ({_error}): install python3-dolfinx-real on Debian, or pip install 'uem_dolfinx[wheel]'"
+        f"uem_dolfinx needs mpi4py and DOLFINx ({_error}): python3-dolfinx-real for Debian's /usr/bin/python3, or 'uem_dolfinx[wheel]'"
     ) from _error
 
 from uem_dolfinx import errors

@@ -111,12 +111,12 @@ def compiling(what: str) -> Iterator[None]:
         what: compiled forms in words, e.g. ``"the residual"``.
     """
     ffcx = logging.getLogger("ffcx")
-    told = False
+    said = False
 
     def info(message: object, *_: object) -> None:
-        nonlocal told
-        if not told and str(message).startswith("Compiler stage"):
-            told = True
+        nonlocal said
+        if not said and str(message).startswith("Compiler stage"):
+            said = True
             logger.info("compiling %s: later runs find it in the cache", what)
 
     # FFCx logs the stages of a compilation, at a level that it sets itself; forms found in its cache have no stages

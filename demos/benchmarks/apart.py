@@ -27,7 +27,7 @@ def run_on(ranks: int, script: str, *, counting: bool = False, verbose: bool = F
     mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
     if mpiexec is None:
         raise RuntimeError(
-            f"no mpiexec beside {sys.executable} or on the PATH: install one, or call this script with --where here"
+            f"no mpiexec in the folder of {sys.executable} or on the PATH: install one, or call this script with --where here"
         )
     environment = outside_mpi()
     # Open MPI 4 and 5: more ranks than cores, none of them bound to the cores of another run

@@ -26,7 +26,7 @@ COMM = MPI.COMM_WORLD
 
 #: What counts as right, for all methods alike: forces and works to 1 %, overlaps to 1e-3 of the smallest element at the contact.
 FORCE, OVERLAP, BALANCE = 1e-2, 1e-3, 1e-3
-#: A method that has spent more than so many Newton iterations for each load step it was asked for and is not at the end, or so many
+#: A method that has spent more than so many Newton iterations for each planned load step without coming to the end, or so many
 #: times the time steps, counts as one that does not converge.
 PATIENCE = 20
 #: Newton iterations that a cut step has spent.
@@ -34,7 +34,7 @@ LOST = 50
 
 
 class NotApplicable(Exception):
-    """A method cannot be asked for what a case is about."""
+    """A method does not have what a case is about."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,9 @@ class Trial:
             self._give_up(step.number > PATIENCE * (steps + 4), step.number, steps)
 
     @staticmethod
-    def _give_up(hopeless: bool, number: int, asked: int) -> None:
+    def _give_up(hopeless: bool, number: int, planned: int) -> None:
         if hopeless:
-            raise uem.ConvergenceError(f"given up after {number} steps instead of {asked}, cut for want of convergence")
+            raise uem.ConvergenceError(f"given up after {number} steps instead of {planned}, cut for want of convergence")
 
     def check(self, what: str, value: float, tolerance: float) -> None:
         """Note a figure; all ranks must know the same."""

@@ -57,7 +57,7 @@ def bar_on_wall(courant: float, event: float | None, trial: Trial) -> None:
     """A bar hits a rigid wall: no energy won, none lost where touches are found, and an impulse that is right.
 
     Steps that resolve the wave see it run through 9 elements, at the Courant limit through all and back, with a pressure of
-    rho c v. Longer ones cannot tell how much of the energy is in vibrations: between a plastic impact and an elastic one all is right.
+    rho c v. With longer ones the energy of vibrations is not known: between a plastic impact and an elastic one all is right.
     """
     n, c = 16, 10.0
     h = 1 / n
@@ -124,7 +124,7 @@ def pushed(thickness: float, trial: Trial) -> None:
         whole = replace(sides[0], name="plate", entities=np.unique(np.concatenate([side.entities for side in sides])))
         scene.unite(scene.side(1, 1, 0), whole)
         problem = trial.create(scene.F, scene.u, scene.moduli, h, bcs=scene.bcs, contacts=scene.contacts)
-        # steps that are cut are what is asked for here
+        # steps that are cut are the subject of this case
         trial.iterations += sum(step.newton_iterations for step in uem.load_steps(problem, steps))
         forces.append(scene.reaction(top)[1])
     trial.check("force in one step over that in many", forces[1] / forces[0] - 1, FORCE)

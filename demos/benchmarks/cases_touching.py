@@ -36,7 +36,7 @@ NUDGES = (0.0, *(s * np.spacing(0.5) for s in (1, -1, 4, -4)), 1e-12, -1e-9, 1e-
 
 
 def vertex(height: float, law: type, trial: Trial) -> None:
-    """A contactor on a vertex of the target, and beside it by a few bits: lawful, and the same force."""
+    """A contactor on a vertex of the target, and a few bits off it: lawful, and the same force."""
     forces = []
     for nudge in (1e-3, -1e-3, *NUDGES):
         boxes = [Box((-1.0, -1.0), (1.0, 0.0), (8, 4)), Box((-0.5, 0.0), (0.5, 1.0), (4, 4), 2.0)]
@@ -55,7 +55,7 @@ def vertex(height: float, law: type, trial: Trial) -> None:
 
 
 def groove(trial: Trial) -> None:
-    """A slim tip beside the bottom of grooves of 140 to 30 degrees, down in one step and in four: held by both flanks, and mirrored."""
+    """A slim tip next to the bottom of grooves of 140 to 30 degrees, down in one step and in four: held by both flanks, and mirrored."""
     h, slopes = 0.25, (0.36, 0.9, 1.0, 1.1, 1.7, 3.7)
     if trial.column.method == "mortar":
         # one equation for a tip's node cannot keep it off either of two flanks that all but face each other
@@ -254,7 +254,7 @@ def loose(load: float, gap: float, sides: bool, trial: Trial) -> None:
 def rocking(trial: Trial) -> None:
     """A loose round body, askew above the floor, falls and rocks until it lies under its weight.
 
-    Nothing tells its place along the floor but the slopes of facets; a force along it to 1 % of the weight is no error.
+    Only the slopes of facets determine its place along the floor; a force along it to 1 % of the weight is no error.
     """
 
     def pose(x: np.ndarray, body: int) -> np.ndarray:
@@ -286,7 +286,7 @@ def lifted(trial: Trial) -> None:
 
 
 def beside(g: int, sliding: str, rollers: bool, trial: Trial) -> None:
-    """A long block, its far end held, under a short stiff punch: whatever holds its contactors, nothing beside the punch is pressed."""
+    """A long block, its far end held, under a short stiff punch: whatever holds its contactors, nothing next to the punch is pressed."""
     h, length = 0.25 if g == 2 else 0.5, 30.0 if g == 2 else 8.0
     across, n = [1.0] * (g - 2), [round(1 / h)] * (g - 1)
     lower = Box([0.0] * (g - 1) + [-1.0], [length, *across, 0.0], [round(length / h), *n])
@@ -305,7 +305,7 @@ def beside(g: int, sliding: str, rollers: bool, trial: Trial) -> None:
     far = nodes[scene.V.tabulate_dof_coordinates()[nodes, 0] > end]
     ground, punch = (scene.reaction(scene.side(body, g - 1, body))[-1] for body in (0, 1))
     trial.check("force beside the punch", COMM.allreduce(float(np.abs(scene.residual()[far, -1]).sum())) / ground, FORCE)
-    # rollers carry a part of what is sheared beside the punch
+    # rollers carry a part of what is sheared next to the punch
     trial.check("force of ground and punch", punch / ground + 1, FORCE)
     check_laws(trial, scene, h)
 
@@ -314,7 +314,7 @@ CASES = [
     Case("vertex ridge", "contactor on a vertex of a ridge to the last bit", partial(vertex, 0.3, uem.StVenantKirchhoff)),
     Case("vertex flat", "contactor on a vertex of a plane to the last bit", partial(vertex, 0.0, uem.LinearElastic)),
     Case("vertex valley", "contactor on a vertex of a valley to the last bit", partial(vertex, -0.3, uem.StVenantKirchhoff)),
-    Case("beside a groove", "a tip beside the bottom of grooves of 140 to 30 degrees", groove),
+    Case("beside a groove", "a tip next to the bottom of grooves of 140 to 30 degrees", groove),
     Case("edge 3D", "contactors on edges of a roof and a valley to the last bit", edge),
     Case("rest", "touching, but nothing pushes", rest),
     Case("grazing", "sliding at zero pressure, and off the end", grazing),
@@ -323,7 +323,7 @@ CASES = [
     *(
         Case(
             f"beside {g}D {sliding}{' rollers' * rollers}",
-            "a far end that is held, beside a short punch",
+            "a far end that is held, next to a short punch",
             partial(beside, g, sliding, rollers),
             quick=(g == 2) == rollers,
         )
@@ -331,7 +331,7 @@ CASES = [
     ),
     Case("contactor led", "Dirichlet values on the contactors, the target gives way", led_contactor),
     Case("contactor fought", "contradicting Dirichlet values", fought_contactor),
-    Case("clamped corner", "contactor beside a node of the target that is held", clamped_corner),
+    Case("clamped corner", "contactor next to a node of the target that is held", clamped_corner),
     Case("two-pass 3:4", "meshes that are not nested", partial(two_pass, (3, 4))),
     Case("two-pass 7:24", "meshes that are not nested", partial(two_pass, (7, 24))),
     Case("two-pass round", "a round block, meshes that are not nested", two_pass_round),

@@ -37,7 +37,7 @@ def counts() -> bool:
 
 
 #: What is counted, in the order of the library's enumeration.
-KINDS = ("collectives", "reduced_bytes", "told_bytes", "row_bytes", "sent_bytes", "messages")
+KINDS = ("collectives", "reduced_bytes", "gathered_bytes", "row_bytes", "sent_bytes", "messages")
 
 
 @contextmanager

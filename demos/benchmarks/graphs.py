@@ -84,7 +84,7 @@ def draw_scene(path: Path, points: Sequence[Point]) -> None:
 
 
 def draw_all(path: str, points: Sequence[Point]) -> list[str]:
-    """A picture of every scene beside ``path``, which itself shows up to three of them against time (collective).
+    """A picture of every scene in the folder of ``path``, which itself shows up to three of them against time (collective).
 
     Returns:
         The names of the pictures.

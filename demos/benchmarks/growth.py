@@ -4,8 +4,8 @@ A count q of the busiest of p ranks, of N unknowns in all, is fitted by
 
     q = a + b (N / p)^(2/3) + c N / p + m min(p - 1, 26) + d (p - 1) + e N^(2/3)
 
-what every rank does in any case; the surfaces and the halo of its part; its volume, of memory only; for each rank beside it, of rows and
-messages; what it tells every other rank; and the whole surface. The last two are what does not scale. No coefficient is negative, and
+what every rank does in any case; the surfaces and the halo of its part; its volume, of memory only; for each other rank, of rows and
+messages; what it sends to every other rank; and the whole surface. The last two are what does not scale. No coefficient is negative, and
 relative errors are least squares, so that a term that does not help is zero.
 """
 
@@ -132,8 +132,8 @@ def fitted(rows: list[dict[str, Any]], count: str) -> dict[str, float]:
     terms = COUNTED_BY.get(count, ("always", "each_rank"))
     if len(rows) <= len(terms):
         return {}
-    told = np.array([row[count] for row in rows])
-    A = np.array([[TERMS[name](row["dofs"], row["ranks"]) for name in terms] for row in rows]) / told[:, None]
+    counted = np.array([row[count] for row in rows])
+    A = np.array([[TERMS[name](row["dofs"], row["ranks"]) for name in terms] for row in rows]) / counted[:, None]
     scale = np.linalg.norm(A, axis=0)
     x, left = nnls(A / scale, np.ones(len(rows)))
     return (

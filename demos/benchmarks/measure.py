@@ -1,4 +1,4 @@
-"""How methods are measured: one point per scene, method and parameter, and the questions that are asked of all points together.
+"""How methods are measured: one point per scene, method and parameter, and comparisons of all points together.
 
 Times are the median of warm runs, from the making of the problem to its last state; the first run, in which forms are compiled,
 is not counted, and reading the mesh and measuring errors are off the clock.
@@ -58,7 +58,7 @@ def measure(scene: Scene, method: str, parameter: float | None = None, runs: int
         method: one of ``methods.ALL``.
         parameter: multiple of the scene's stiffness, or of its h (barrier).
         runs: that are timed; with none the first counts.
-        progress: tell the point.
+        progress: print the point.
 
     Returns:
         The point. A method that failed has no errors but ``failed``, the name of what was raised.
@@ -118,7 +118,7 @@ def sweep(
         sizes: coarse to fine.
         names: of the methods.
         runs: that are timed; with none the first counts.
-        progress: tell every point.
+        progress: print every point.
     """
     points: list[Point] = []
     tried = {name: SWEEPS[name] for name in names}
@@ -179,9 +179,9 @@ def at_a_glance(points: list[Point]) -> list[dict[str, str]]:
         cheapest: dict[float, dict[str, Point]] = {}
         for level in LEVELS:
             for name, own in by_method.items():
-                # what is below the accuracy of the answer cannot be told
-                told = [p for p in own if decisive(p) is not None and level > p.get("reference", 0.0)]
-                reached = [p for p in told if decisive(p) <= level]
+                # errors below the accuracy of the reference are not known
+                known = [p for p in own if decisive(p) is not None and level > p.get("reference", 0.0)]
+                reached = [p for p in known if decisive(p) <= level]
                 if reached:
                     cheapest.setdefault(level, {})[name] = min(reached, key=lambda p: p["seconds"])
         for name, own in by_method.items():
@@ -205,7 +205,7 @@ def at_equal_error(points: list[Point]) -> list[dict[str, Any]]:
     for scene, group in grouped(points, label).items():
         curves = {}
         for name, own in grouped((p for p in group if decisive(p) is not None), lambda p: p["method"]).items():
-            # what takes longer for a larger error is beside the point
+            # what takes longer for a larger error is left out
             front = [p for p in own if not any(q["seconds"] < p["seconds"] and decisive(q) <= decisive(p) for q in own)]
             curves[name] = np.array(sorted((decisive(p), p["seconds"]) for p in front)).T
         if len(curves) < 2:

@@ -36,7 +36,7 @@ class Scene:
         h: size of the contactor's cells, a length.
         options: makes further arguments of the problem for a method, anew for each run.
         run: leads the problem to the state that is measured; yields its steps.
-        facts: what else a point in the table tells.
+        facts: what else the row of a point in the table contains.
     """
 
     problem: str

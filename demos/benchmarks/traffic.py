@@ -37,7 +37,7 @@ class Counting:
 
     Attributes:
         received: bytes so far.
-        by_ranks: bytes of them in calls in which every rank tells every other the same number of them.
+        by_ranks: bytes of them in calls in which every rank sends the same number of them to every other.
         partners: number of ranks that have sent rows here.
     """
 
@@ -63,8 +63,8 @@ class Counting:
         self.partners = max(self.partners, int((np.delete(counts, self.rank) > 0).sum()))
 
     def _count_all_but_mine(self, received: np.ndarray) -> None:
-        told = received.nbytes * (self.size - 1) // self.size
-        self.received, self.by_ranks = self.received + told, self.by_ranks + told
+        figures = received.nbytes * (self.size - 1) // self.size
+        self.received, self.by_ranks = self.received + figures, self.by_ranks + figures
 
 
 class Watch:
@@ -149,7 +149,7 @@ def search_traffic(surfaces: Surfaces) -> dict[str, Any]:
 
     Returns:
         ``contactors`` and ``facets`` on all ranks; ``share_max``, the most contactors and facets that a rank has; ``bytes_max``, the
-        most bytes that a rank receives; ``bytes_per_share``, the most per contactor and facet of its own; ``asked``, ranks that a
+        most bytes that a rank receives; ``bytes_per_share``, the most per contactor and facet of its own; ``searched_ranks``, ranks that a
         contactor asks; ``bytes_per_rank``, those of them that every other rank sends; ``partners``, the most ranks that send a rank rows
         in one call; ``halo_bytes_max``, the most bytes that come with the values at ghost nodes of which nodal normals are made;
         ``imbalance``, the most contactors owned and points projected over the mean.
@@ -161,9 +161,9 @@ def search_traffic(surfaces: Surfaces) -> dict[str, Any]:
     elsewhere = comm.alltoall(list(np.bincount(config.owner_of(config.to_global(ghosts)), minlength=comm.size)))
     # sums go to the owners, and back to the ghosts
     halo = 8 * config.gdim * (len(ghosts) + sum(elsewhere))
-    told = (len(points), len(target.facets.dofs), watch.counting.received, watch.projected, halo)
-    told += (watch.counting.by_ranks, watch.counting.partners)
-    contactors, facets, received, projected, halos, by_ranks, partners = np.array(comm.allgather(told)).T
+    figures = (len(points), len(target.facets.dofs), watch.counting.received, watch.projected, halo)
+    figures += (watch.counting.by_ranks, watch.counting.partners)
+    contactors, facets, received, projected, halos, by_ranks, partners = np.array(comm.allgather(figures)).T
     shares, work = contactors + facets, contactors + projected
     return {
         "contactors": int(contactors.sum()),
@@ -173,7 +173,7 @@ def search_traffic(surfaces: Surfaces) -> dict[str, Any]:
         "bytes_per_share": float((received / np.maximum(shares, comm.size)).max()),
         "bytes_per_rank": float(by_ranks.max() / max(comm.size - 1, 1)),
         "partners": int(partners.max()),
-        "asked": float(projected.sum() / contactors.sum()),
+        "searched_ranks": float(projected.sum() / contactors.sum()),
         "halo_bytes_max": int(halos.max()),
         "imbalance": float(work.max() / work.mean()),
     }

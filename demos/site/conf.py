@@ -1,6 +1,6 @@
 """Settings of the documentation: Sphinx with MyST; the demos are read as the notebooks that they are, see ``reading``.
 
-.ci/site builds it. Pages lie here, in the demos and in the package; what is generated goes to the folder that is asked for.
+.ci/site builds it. Pages lie here, in the demos and in the package; what is generated goes to the folder that is named.
 """
 
 import sys
@@ -127,7 +127,7 @@ def with_late_pictures(app, doctree, page: str) -> None:
 
 
 def with_notebooks(app, error) -> None:
-    """A notebook and the script beside the page of each demo."""
+    """A notebook and the script in the folder of each demo's page."""
     if not error and app.builder.format == "html":
         reading.write_notebooks(Path(app.outdir))
 

@@ -37,7 +37,7 @@ def options(text: str) -> str:
                 choices = isinstance(option.value, ast.Tuple)
                 values = " or ".join(f"`{ast.unparse(v)}`" for v in (option.value.elts if choices else [option.value]))
                 rows.append(f"| `--{option.arg.replace('_', '-')}` | {explained.get(option.arg, '')} | {values} |")
-    head = "**Options**, beside `--plot FILE.png`, `--setup FILE.png`, `--json FILE` and `--output DIR`:\n\n"
+    head = "**Options**, in addition to `--plot FILE.png`, `--setup FILE.png`, `--json FILE` and `--output DIR`:\n\n"
     head += "| option | meaning | default, the first of several choices |\n|---|---|---|\n"
     return head + "\n".join(rows) + "\n" if rows else ""
 
@@ -107,7 +107,7 @@ def cards() -> str:
     for title, (about, entries) in groups.items():
         inside = "\n".join(entry.card() for entry in entries)
         pages = "\n".join(entry.name for entry in entries)
-        parts.append(f"## {title}\n\n{about}\n\n::::{{grid}} 1 2 2 3\n:gutter: 3\n\n{inside}::::\n")
+        parts.append(f"## {title}\n\n{about}\n\n::::{{grid}} 1 1 2 2\n:gutter: 3\n\n{inside}::::\n")
         parts.append(f"```{{toctree}}\n:hidden:\n\n{pages}\n```\n")
     return "\n".join(parts)
 

@@ -50,9 +50,9 @@ def test_a_step_on_two_and_four_ranks(folder, declared):
     two, four = found["counts"]
     assert (two["ranks"], four["ranks"]) == (2, 4) and two["dofs"] == four["dofs"]
     assert four["iterations"] == two["iterations"] and four["collectives"] == pytest.approx(two["collectives"], rel=0.02)
-    assert 0 < four["told_bytes"] / 3 < 1.2 * two["told_bytes"]
+    assert 0 < four["gathered_bytes"] / 3 < 1.2 * two["gathered_bytes"]
     assert 0 < four["row_bytes"] < 1.1 * two["row_bytes"]
     # no rank hears a part of the surface by what all tell all: a facet has 37 numbers
-    assert four["told_bytes"] < 8 * 37 * 6**2
+    assert four["gathered_bytes"] < 8 * 37 * 6**2
     stages = [row["collectives"] for row in found["stages"] if row["ranks"] == 4]
     assert sum(stages) == pytest.approx(four["collectives"] + four["solver_collectives"])

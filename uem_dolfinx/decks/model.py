@@ -1,4 +1,4 @@
-"""What an input file of Abaqus or CalculiX declares beside its mesh: materials, conditions, contacts, steps and loads, by names."""
+"""What an input file of Abaqus or CalculiX declares in addition to its mesh: materials, conditions, contacts, steps and loads, by names."""
 
 from __future__ import annotations
 
@@ -346,7 +346,7 @@ def _isotropic(options: dict[str, str]) -> None:
 
 
 def model_of(deck: Deck) -> Model:
-    """Read the keywords of a deck beside its mesh, and name the nodes and sides that they mention as sets and surfaces.
+    """Read the keywords of a deck that are not of its mesh, and name the nodes and sides that they mention as sets and surfaces.
 
     Raises:
         InputError: for a keyword that cannot be read, or a deck without a step that is taken.

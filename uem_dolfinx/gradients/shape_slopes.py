@@ -129,6 +129,6 @@ def _foot_slopes(s: Spacers, N: Array) -> tuple[Array, Array]:
     T[:, :, 1:] = np.einsum("k,kaf,kg->kfag", s.height, s.dN, n) - np.einsum("ka,kfg->kfag", N, t)
     m = np.einsum("kfg,keg->kfe", t, t)
     up = np.concatenate([n[:, None], -N[:, :, None] * n[:, None]], axis=1)
-    # a rank without contactors tells no width
+    # a rank without contactors has no width
     width = (1 + nn) * n.shape[1]
     return np.linalg.solve(m, T.reshape(k, fdim, width)), up.reshape(k, width)

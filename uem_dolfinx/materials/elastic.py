@@ -140,7 +140,7 @@ class Elastic(ABC):
         """Measure of the volumetric part; plane stress needs no reduced integration."""
         if self.kind == "plane_stress":
             return dx
-        V = given.kind("u", u, isinstance(u, fem.Function), "the displacement, whose degree tells the points").function_space
+        V = given.kind("u", u, isinstance(u, fem.Function), "the displacement, whose degree determines the points").function_space
         cell, degree = compat.cell_name(V.mesh), compat.lagrange_degree(V) or 0
         simplex = cell in ("triangle", "tetrahedron")
         if degree == 1 and (simplex or self.kind == "axisymmetric"):
@@ -259,9 +259,9 @@ def check_kind(kind: str, u: Any) -> None:
         fitting = "'3d'" if len(u) == 3 else "'plane_strain', 'plane_stress' or 'axisymmetric'"
         raise InputError(f"kind = '{kind}' does not fit a displacement with {len(u)} components: expected {fitting}")
     if is_axisymmetric(u) != (kind == "axisymmetric"):
-        told = "has not been declared" if kind == "axisymmetric" else "has been declared axisymmetric"
+        state = "has not been declared" if kind == "axisymmetric" else "has been declared axisymmetric"
         remedy = "call uem.axisymmetric(mesh) first" if kind == "axisymmetric" else "take kind = 'axisymmetric'"
-        raise InputError(f"kind = '{kind}' does not fit the displacement's mesh, which {told}: {remedy}")
+        raise InputError(f"kind = '{kind}' does not fit the displacement's mesh, which {state}: {remedy}")
 
 
 def material_of(f: Any) -> Any:

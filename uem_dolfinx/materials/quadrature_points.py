@@ -119,7 +119,7 @@ class QuadraturePoints:
     def spread_from(self, others: QuadraturePoints) -> Array:
         """Values at these points of what other points of the cells give as a constant or (multi)linear: rows sum to 1."""
         if others.degree == 0:
-            # the points beside a centre count as one
+            # the points around a centre count as one
             count = len(others.points)
             return np.full((len(self.points), count), 1.0 / count)
         linear = forms.create_lagrange_element(compat.cell_name(self.mesh), 1)

@@ -1,6 +1,6 @@
 """Other codes on the scenes of ``hertz_cylinder.py`` and ``hertz_sphere.py``: what they are given and answer, how they are run.
 
-Every code gets the same nodes, cells and facets as arrays, runs on one thread in a process told from this one's MPI, and says how
+Every code gets the same nodes, cells and facets as arrays, runs on one thread in a process without this one's MPI, and says how
 long it took.
 """
 
@@ -42,7 +42,7 @@ class Hertz:
         facets: nodes of the facets of each named surface, ``(n_facets, gdim)``.
         contactor: name of the surface of the upper body that comes into contact; the other is ``block_top``.
         supports: names of surfaces, and the component and value that are prescribed there.
-        led: those of a second step, in which friction tells.
+        led: those of a second step, in which friction acts.
         friction: coefficient of friction.
         parts: how many like it make the whole.
         h: size of the cells in the contact zone.
@@ -139,7 +139,7 @@ def gathered(mesh: Any, tags: Tags, upper: str, **scene: Any) -> Hertz | None:
 
 
 def run(command: Sequence[str], folder: Path, timeout: float) -> str:
-    """Run a program in a folder, on one thread, told from this process's MPI.
+    """Run a program in a folder, on one thread, without this process's MPI.
 
     Args:
         command: program and arguments.
@@ -178,8 +178,8 @@ def python_with(module: str, *pythons: str) -> str | None:
     return None
 
 
-def told_by(code: str, python: str, script: Path, timeout: float, **scene: Any) -> dict[str, Any]:
-    """What a script tells that solves the scene with another code, in a Python of its own: ``scene.npz answer.json``.
+def answer_of(code: str, python: str, script: Path, timeout: float, **scene: Any) -> dict[str, Any]:
+    """The answer of a script that solves the scene with another code, in a Python of its own: ``scene.npz answer.json``.
 
     Args:
         code: its name.
@@ -198,10 +198,10 @@ def told_by(code: str, python: str, script: Path, timeout: float, **scene: Any) 
         folder = Path(name)
         np.savez(folder / "scene.npz", **scene)
         run([python, "-I", str(script), "scene.npz", "answer.json"], folder, timeout)
-        told: dict[str, Any] = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
-    if not told["converged"]:
-        raise PeerError(f"{code} did not converge in {told['iterations']} iterations")
-    return told | {"seconds": float(np.median(told["seconds"][1:] or told["seconds"]))}
+        answer: dict[str, Any] = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
+    if not answer["converged"]:
+        raise PeerError(f"{code} did not converge in {answer['iterations']} iterations")
+    return answer | {"seconds": float(np.median(answer["seconds"][1:] or answer["seconds"]))}
 
 
 def timed(solve: Callable[[], float], runs: int, timeout: float) -> float:

@@ -1,6 +1,6 @@
 """The scene in CalculiX: plane strain triangles CPE3 or tetrahedra C3D4, surface-to-surface penalty contact, SPOOLES, one increment.
 
-Small strain (no NLGEOM), several springs on each edge of the arc, residuals and corrections asked for to 1e-8. The stiffness of the
+Small strain (no NLGEOM), several springs on each edge of the arc, tolerance of residuals and corrections 1e-8. The stiffness of the
 springs is chosen so that the overlap changes P by less than the mesh does: 0.07 E R / h^2; ten times as much takes half as many
 iterations again. With friction there is as stiff a spring along the surface. Debian's CalculiX 2.20 has no PaStiX; its iterative
 solver took about as long on 5,500 nodes and longer on 25,000. Node-to-surface contact came to two thirds of P. Mortar contact

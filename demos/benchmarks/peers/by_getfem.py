@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from benchmarks.peers import REPEATED, Answer, Hertz, PeerError, python_with, told_by
+from benchmarks.peers import REPEATED, Answer, Hertz, PeerError, python_with, answer_of
 
 INSTALL = "apt-get install python3-getfem"
 SETTINGS = "nodal multipliers, augmentation 100 E, feet found once, MUMPS, 1 step; time from meshes in memory"
@@ -53,13 +53,13 @@ def solve(scene: Hertz, runs: int, timeout: float, rtol: float) -> Answer:
     }
     numbers = {"nu": scene.nu, "supports": json.dumps(scene.supports), "runs": runs, "enough": REPEATED * timeout, "rtol": rtol}
     bodies = {"x": scene.x, "cells": scene.cells, "upper": scene.upper}
-    told = told_by("GetFEM", python, SCRIPT, timeout, **bodies, **arrays, **numbers)
+    answer = answer_of("GetFEM", python, SCRIPT, timeout, **bodies, **arrays, **numbers)
     # GetFEM has its own numbers of the nodes
-    here, there = (np.lexsort(np.round(x.T / scene.h, 6)) for x in (scene.x[scene.nodes(scene.contactor)], np.array(told["x"])))
-    pressures = scene.E * np.array(told["forces"])[there] / scene.sizes(scene.contactor)[here]
+    here, there = (np.lexsort(np.round(x.T / scene.h, 6)) for x in (scene.x[scene.nodes(scene.contactor)], np.array(answer["x"])))
+    pressures = scene.E * np.array(answer["forces"])[there] / scene.sizes(scene.contactor)[here]
     return Answer(
-        told["seconds"],
-        told["iterations"],
-        scene.parts * scene.E * told["P"],
+        answer["seconds"],
+        answer["iterations"],
+        scene.parts * scene.E * answer["P"],
         float(pressures.max()),
     )

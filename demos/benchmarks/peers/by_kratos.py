@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from benchmarks.peers import REPEATED, Answer, Hertz, PeerError, python_with, told_by
+from benchmarks.peers import REPEATED, Answer, Hertz, PeerError, python_with, answer_of
 
 INSTALL = "pip install KratosContactStructuralMechanicsApplication KratosLinearSolversApplication; --kratos names that python"
 SETTINGS = "ALM mortar, dual scalar multipliers, GMRES with AMGCL, 1 step; time from nodes and cells in memory"
@@ -69,8 +69,8 @@ def solve(scene: Hertz, runs: int, timeout: float, rtol: float) -> Answer:
     }
     numbers = {"E": scene.E, "nu": scene.nu, "runs": runs, "enough": REPEATED * timeout, "rtol": rtol}
     words = {"supports": json.dumps(scene.supports), "linear_solver": json.dumps(LINEAR_SOLVER | {"tolerance": rtol})}
-    told = told_by("Kratos", found, SCRIPT, timeout, x=scene.x, cells=scene.cells, **arrays, **numbers, **words)
-    return Answer(told["seconds"], told["iterations"], scene.parts * told["P"], told["p_max"])
+    answer = answer_of("Kratos", found, SCRIPT, timeout, x=scene.x, cells=scene.cells, **arrays, **numbers, **words)
+    return Answer(answer["seconds"], answer["iterations"], scene.parts * answer["P"], answer["p_max"])
 
 
 def outward(scene: Hertz, name: str) -> np.ndarray:

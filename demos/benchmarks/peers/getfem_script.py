@@ -62,10 +62,10 @@ def solve(bodies):
     model.add_nodal_contact_between_nonmatching_meshes_brick(
         rules["upper"], rules["block"], "upper", "block", "forces", "r", CONTACT, CONTACT, 1, 0, 1
     )
-    told = model.solve("max_res", rtol, "max_iter", 100, "lsolver", "mumps")
+    count = model.solve("max_res", rtol, "max_iter", 100, "lsolver", "mumps")
     seconds = time.process_time() - start
     own = spaces["upper"].basic_dof_on_region(CONTACT)[::g]
-    return seconds, model, told, spaces["upper"].basic_dof_nodes()[:, own].T
+    return seconds, model, count, spaces["upper"].basic_dof_nodes()[:, own].T
 
 
 bodies = {"upper": body(upper, "contactor"), "block": body(~upper, "target")}

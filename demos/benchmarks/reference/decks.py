@@ -2,7 +2,7 @@
 
 python3 demos/benchmarks/reference/decks.py --deck test/cubesmortar.inp --json figures.json
 
-The name of the file tells the scene. Meshes, sets and surfaces are read from it. Some decks are run with all that stands in them; for
+The scene is named by its file. Meshes, sets and surfaces are read from it. Some decks are run with all that stands in them; for
 the others materials, conditions and loads are written here in UFL.
 """
 

@@ -1,4 +1,4 @@
-"""Writes the tables of the pages here from the JSON files beside it, between the marks that name them.
+"""Writes the tables of the pages here from the JSON files in its folder, between the marks that name them.
 
 python3 demos/benchmarks/report/tables.py
 

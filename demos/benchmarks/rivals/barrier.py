@@ -119,7 +119,7 @@ class BarrierSystem(PushedSystem):
         return ipctk.BarrierPotential(self.distance, self._pressure, True)
 
     def _push(self) -> Array:
-        """Forces of the barrier on all nodes ``(n, gdim)``; keeps the collisions, and tells the pairs."""
+        """Forces of the barrier on all nodes ``(n, gdim)``; keeps the collisions, and reports the pairs."""
         forces = np.zeros((self.config.n_local, self.config.gdim))
         if self._mesh is not None:
             V = self._vertices()
@@ -221,7 +221,7 @@ class BarrierSystem(PushedSystem):
         with timed("barrier"):
             A = self._hessian()
         self.solver.set_operator(state.trial, A, None)
-        # the solver tells matrices by their handles, so that one must live until the next is made
+        # the solver distinguishes matrices by their handles, so that one must live until the next is made
         self._A = A
         return A
 
@@ -274,7 +274,7 @@ class BarrierSystem(PushedSystem):
         return length
 
     def _squeezed(self) -> bool:
-        """Whether surfaces are so near that collision detection has no digits left to tell them apart."""
+        """Whether surfaces are so near that collision detection has no digits left to distinguish them."""
         if self._collisions.empty():
             return False
         nearest = self._collisions.compute_minimum_distance(self._mesh, self._vertices())
