@@ -106,6 +106,7 @@ def adapt(
 
     Raises:
         InputError, InputTypeError: for wrong arguments, neither or both of ``tolerance`` and ``cells``, or what ``error_estimate`` refuses.
+        InputError: if the goal is zero on a mesh, e.g. a force on what nothing touches, so that no error can be over it.
         MeshError: if the cells do not follow the sizes, since the geometry fixes them.
 
     Example:
@@ -136,6 +137,11 @@ def adapt(
         given.kind("what make returns", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         steps = list(load_steps(problem, 1)) if solve is None else solve(problem)
         estimate = error_estimate(problem) if goal is None else goal_error(problem, goal(problem))
+        if np.isnan(estimate.relative):
+            raise InputError(
+                f"adapt: the {'displacement' if goal is None else 'goal'} is zero on mesh {len(found) + 1}, to rounding, and its error is "
+                "bounded over its value: expected a load that changes it, and a first mesh on which it does"
+            )
         found.append(_measured(problem, estimate, steps, start))
         logger.info("mesh %d: %d cells, estimated error %.3g %%", len(found), found[-1].cells, 100 * found[-1].estimate)
         reached = enough(found, tolerance, cells)

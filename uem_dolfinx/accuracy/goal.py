@@ -48,19 +48,21 @@ class GoalError:
     Attributes:
         value: of the functional.
         error: estimate of the exact value less this one.
+        rounding: part of the value that the tolerance of equilibrium leaves open.
         cells: part of each cell in it, without sign, a Function that is constant in cells, for files and pictures.
         shares: the same of this rank's cells ``(n_owned_cells,)``.
     """
 
     value: float
     error: float
+    rounding: float
     cells: fem.Function = field(repr=False)
     shares: Array = field(repr=False)
 
     @property
     def relative(self) -> float:
-        """Size of the estimate over that of the value; NaN for a value of zero."""
-        return abs(self.error / self.value) if self.value else float("nan")
+        """Size of the estimate over that of the value; NaN for a value that is zero to rounding."""
+        return abs(self.error / self.value) if abs(self.value) > self.rounding else float("nan")
 
     def __str__(self) -> str:
         """The value, and the estimate in per cent."""
@@ -97,6 +99,9 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
         enriched = Enriched(problem)
         value = forms.assemble_scalar(forms.form(whole), config.comm)
         of_u = enriched.assembled(forms.expanded(ufl.derivative(whole, config.whole, enriched.test)))
+        u = fem.Function(enriched.W)
+        u.interpolate(config.u)
+        terms = reduced(config.comm, float(np.abs(of_u.ravel() * u.x.array[: of_u.size]).sum()))
         rows = enriched_rows(enriched)
         system = _System(enriched, rows)
         error = reduced(config.comm, float((of_u * system.correction(-enriched.forces)).sum()))
@@ -115,7 +120,7 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
     cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="goal_error")
     cells.x.array[: len(shares)] = shares
     cells.x.scatter_forward()
-    return GoalError(float(value), float(error), cells, shares)
+    return GoalError(float(value), float(error), problem.rtol * terms, cells, shares)
 
 
 def check_goal(problem: UnitedProblem, J: ufl.Form) -> None:
