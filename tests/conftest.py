@@ -200,7 +200,7 @@ def lever(contact: uem.Contact) -> float:
     # across a gap the averaged normals of a soft contact lean by the angle of the facets
     if contact.normal is not None and highest(pair.config.comm, pair.trial.changes) >= MOST_CHANGES:
         return 1e-6
-    return 1e-7 if contact.pair.frictional and not contact.pair.discretisation.at_feet else 1e-11
+    return 1e-7 if contact.pair.frictional and not contact.pair.discretisation.traits.at_feet else 1e-11
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
-from uem_dolfinx.contact.seam.placement import GapRows
+from uem_dolfinx.contact.seam.placement import GapRows, Traits
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -36,7 +36,7 @@ def gauss_points(degree):
 class GaussPoints(OnTarget):
     """Implements ``Discretisation`` for contactors of degree 1 and finite sliding."""
 
-    chained, two_pass, pointwise, at_feet = True, False, False, False
+    traits = Traits(at_feet=False, pointwise=False, chained=True, two_pass=False)
     #: Of polynomials that the quadrature rule integrates exactly.
     degree = 3
 

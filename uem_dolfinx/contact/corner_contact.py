@@ -116,5 +116,5 @@ def _part_of(contact: Contact, config: Configuration, free: Bools, clock: dict[s
     edges = np.concatenate([np.zeros((0, 2), np.int32), *(at.dofs[sides[:, s]][:, two] for s, two in enumerate(ends))])
     theirs.leaves_out = AlongEdges(config, theirs.target, facets.open_sides, END_HOLDS, nodes, edges)
     theirs.ends_hold = False
-    own.ordered_by = theirs.ordered_by = -1 - next(_orders)
+    own.traits = theirs.traits = own.traits._replace(order=-1 - next(_orders))
     return part

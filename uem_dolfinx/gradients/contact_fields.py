@@ -32,7 +32,7 @@ def check_field(problem: UnitedProblem, what: str, m: fem.Function) -> None:
         rubs, thickens = as_law(contact.friction).field is m, contact.offset is m
         if (rubs or thickens) and contact.corners_touch():
             raise InputError(f"{called}: its target's corners touch: expected corners=False")
-        if thickens and (not pair.discretisation.pointwise or isinstance(pair.discretisation, Bernstein)):
+        if thickens and (not pair.discretisation.traits.pointwise or isinstance(pair.discretisation, Bernstein)):
             raise InputError(
                 f"{called}, is an offset: there is no derivative by its values with mortar or degree 2, whose gaps are of several nodes: "
                 "expected coupling='node_to_surface' and degree 1, or ContactParameter(contact, 'offset')"

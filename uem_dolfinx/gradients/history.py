@@ -405,7 +405,10 @@ def _check_friction(problem: UnitedProblem, contact: Any) -> None:
     """Refuse contacts with friction whose history has no derivatives."""
     pair, law = contact.pair, as_law(contact.friction)
     for wrong, expected in (
-        (not pair.discretisation.pointwise or problem.config.degree > 1, "coupling='node_to_surface' and cells of degree 1"),
+        (
+            not pair.discretisation.traits.pointwise or problem.config.degree > 1,
+            "coupling='node_to_surface' and cells of degree 1",
+        ),
         (contact.sliding != "finite", "sliding='finite'"),
         (contact.normals != "facet", "normals='facet'"),
         (type(law) is not Coulomb or law.per_area or law.per_point or follows_load(law), "Coulomb's law, without limit or load"),

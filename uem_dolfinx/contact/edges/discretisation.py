@@ -15,6 +15,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.edges.placement import EdgeKinematics
 from uem_dolfinx.contact.seam.base import OnTarget
+from uem_dolfinx.contact.seam.placement import Traits
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.edge_crossings import Crossings
@@ -48,16 +49,15 @@ class Edges(OnTarget):
     """Implements ``Discretisation``: nodes on edges with the edges that cross theirs; arguments as for ``OnTarget``.
 
     Args:
-        ordered_by: see ``Discretisation``.
+        order: see ``Traits``.
     """
 
-    chained, two_pass = True, True
-    pointwise = at_feet = False
+    traits = Traits(at_feet=False, pointwise=False, chained=True, two_pass=True)
     target: EdgeTarget
 
-    def __init__(self, config: Configuration, nodes: Indices, target: EdgeTarget, *, ordered_by: int = -1, **how: Any):
+    def __init__(self, config: Configuration, nodes: Indices, target: EdgeTarget, *, order: int = -1, **how: Any):
         super().__init__(config, nodes, target, **how)
-        self.ordered_by = ordered_by
+        self.traits = self.traits._replace(order=order)
 
     def place(self, points: Array, state: PairState) -> EdgeKinematics:
         """Find the crossings (collective); see ``Discretisation``."""

@@ -93,7 +93,7 @@ class Sliding:
 
     def place(self, kinematics: Kinematics, state: FrictionState) -> None:
         """Find the anchors, or the relative motions of contactors, in the current configuration (collective)."""
-        if self.discretisation.pointwise:
+        if self.discretisation.traits.pointwise:
             self._anchors, self._held_by = anchors_of(state, self.discretisation.target, self.config.gdim == 3)
         elif self._last is None:
             here = self.config.x[: self.config.n_owned].copy()
@@ -105,7 +105,7 @@ class Sliding:
 
     def replace(self, kinematics: Kinematics) -> None:
         """Replace the kinematics at the same displacement (collective)."""
-        if self.discretisation.pointwise:
+        if self.discretisation.traits.pointwise:
             way = None if self._held_by is None else Ties.of(self.config, self.nodes, self._held_by, None, True)
             away = kinematics.points - self._anchors
         else:
@@ -149,7 +149,7 @@ class Sliding:
 
     def _at_anchors(self, state: PairState) -> Bools:
         """Contactors that stick to a point of the target and can follow it ``(n,)``."""
-        stuck = self.active(state) & _of(state).stick & self.discretisation.pointwise
+        stuck = self.active(state) & _of(state).stick & self.discretisation.traits.pointwise
         return stuck & (self.free | ~self.frame.ties.moves).all(axis=1)
 
     def bound(self, state: PairState, lam: Array | None = None) -> Array:
@@ -233,7 +233,7 @@ class Sliding:
         assert isinstance(violated, stick_slip.FrictionViolations)
         seen, pivot, share = violated.seen, self.pivot, kinematics.force_per_multiplier[:, None]
         tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, violated.driven
-        space, size = self.config.gdim == 3 and self.discretisation.pointwise, np.linalg.norm(seen.slip, axis=1)
+        space, size = self.config.gdim == 3 and self.discretisation.traits.pointwise, np.linalg.norm(seen.slip, axis=1)
         # a contactor whose slip reverses first slips the other way, since contactors would otherwise reverse one by one; at the
         # second reversal it sticks, since soft bodies would reverse for ever. Nodes in 3D that begin to slip change direction while
         # the force q is outside the cone; unrestrained bodies (slip above the model's size) stick
@@ -292,8 +292,8 @@ class Sliding:
             directions=self.directions(state),
             slope=self._cone(state)[1] * kinematics.pressure_map(False).force / kinematics.force_per_multiplier,
             normal=kinematics.normal,
-            pointwise=self.discretisation.pointwise,
-            keeps_ties=self.keeps_feet or self.discretisation.at_feet,
+            pointwise=self.discretisation.traits.pointwise,
+            keeps_ties=self.keeps_feet or self.discretisation.traits.at_feet,
         )
 
     def set_redundant(self, equations: ContactRows, redundant: Bools) -> None:
@@ -370,7 +370,7 @@ class Sliding:
         For contactors that stick at points they vanish, since all components follow the same point.
         """
         slips = self.slipping(state) & (state.lam > 0)
-        held = self.active(state) & _of(state).stick & (not self.discretisation.at_feet)
+        held = self.active(state) & _of(state).stick & (not self.discretisation.traits.at_feet)
         which = np.flatnonzero(slips | held)
         if not reduced(self.config.comm, len(which)):
             return []
@@ -383,7 +383,7 @@ class Sliding:
     def anchored(self, state: PairState, kinematics: Kinematics) -> FrictionState:
         """The state in which contactors that do not stick get anchors at their current position."""
         f = _of(state)
-        if not self.discretisation.pointwise:
+        if not self.discretisation.traits.pointwise:
             return f
         loose = ~f.stick | ~self.active(state) | self.frame.cornered
         return anchored(f, kinematics, self.discretisation.target, kinematics.points, loose, self.keeps_feet)

@@ -37,7 +37,7 @@ class EdgeContact(BodiesContact):
 
     def _discretised(self, nodes: Indices, target: Any, **how: Any) -> tuple[Edges, None]:
         """Edges in the order of the bodies."""
-        return Edges(self.config, nodes, target, ordered_by=self._order, **how), None
+        return Edges(self.config, nodes, target, order=self._order, **how), None
 
     def acting_at(self) -> Array:
         """Crossings."""

@@ -24,7 +24,7 @@ class AmongBodies(NodeToSurface):
 
     def __init__(self, config: Configuration, nodes: Indices, target: Neighbour, **how: Any):
         super().__init__(config, nodes, target, **how)
-        self.ordered_by = target.neighbours.number
+        self.traits = self.traits._replace(order=target.neighbours.number)
         # of two edges in contact, the node above a facet of the other body follows it
         self.ends_hold = ~target.neighbours.skin.corners[nodes]
 

@@ -23,7 +23,7 @@ from uem_dolfinx.contact.mortar.rows import Pieces, Terms, WeightedRows, terms_o
 from uem_dolfinx.contact.mortar.segment_motions import slopes
 from uem_dolfinx.contact.mortar.tangent import SegmentPoints
 from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, with_averaged_normals
-from uem_dolfinx.contact.seam.placement import GapRows
+from uem_dolfinx.contact.seam.placement import GapRows, Traits
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -52,8 +52,7 @@ GOES_ON_COVERING = 0.7
 class Mortar(Contactors):
     """Implements ``Discretisation``: contactor facets against the surface of one target; arguments as those of ``Contactors``."""
 
-    chained, two_pass = True, False
-    pointwise = False
+    traits = Traits(at_feet=False, pointwise=False, chained=True, two_pass=False)
 
     #: Whether the last rows were made before any facets had faced each other in the step.
     _afresh = False

@@ -37,8 +37,6 @@ class Contactors(OnTarget):
         faced: keys, independent of the partition, of contactor and target facets that have faced each other in this step ``(p, 2)``.
     """
 
-    at_feet = False
-
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
         super().__init__(config, nodes, target, **how)
         self.surface = surface
@@ -124,7 +122,7 @@ class MortarKinematics(PlacedOnTarget):
         """Weights are integrals of dual functions times shape functions of both sides, over the integral of the contactor's own."""
         of = self.of
         assert self.rows.weights is not None
-        return Ties.of(of.config, of.nodes, self.rows.weights, of.free_of_owned if of.prescribed else None, of.at_feet)
+        return Ties.of(of.config, of.nodes, self.rows.weights, of.free_of_owned if of.prescribed else None, False)
 
     @property
     def force_per_multiplier(self) -> Array:

@@ -23,6 +23,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface
+from uem_dolfinx.contact.seam.placement import Traits
 from uem_dolfinx.contact.seam.pressure_map import Basis, PressureMap, Sums
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -141,8 +142,7 @@ class Bernstein(NodeToSurface):
     """Implements ``Discretisation`` for contactors of degree 2; arguments as for ``NodeToSurface``."""
 
     #: A contactor in the middle of an edge or a facet follows contactors around it.
-    chained = True
-    pointwise = False
+    traits = Traits(at_feet=True, pointwise=False, chained=True, two_pass=True)
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, **how: Any):
         super().__init__(config, nodes, target, **how)

@@ -19,7 +19,7 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
 from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import ContactRows, GapRows, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, GapRows, Traction, Traits
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
@@ -40,8 +40,7 @@ class NodeToSurface(OnTarget):
         chords: trial rows with the weights of the straight pieces between a curved target's nodes [UEM, 4.5].
     """
 
-    chained, two_pass = False, True
-    pointwise = at_feet = True
+    traits = Traits(at_feet=True, pointwise=True, chained=False, two_pass=True)
     #: Whether an end of the target holds contactors that first touch there, for all or for each ``(n,)``.
     ends_hold: bool | Bools = True
     #: Contactors that something else holds, so that they must not touch the target ``(n,)``, or None.
@@ -168,7 +167,7 @@ class NodalKinematics(PlacedOnTarget):
     def ties(self) -> Ties:
         """Weights are the shape functions at the closest points; see ``Kinematics``."""
         of = self.of
-        return Ties.of(of.config, of.nodes, self.weights(), of.free_of_owned if of.prescribed else None, of.at_feet)
+        return Ties.of(of.config, of.nodes, self.weights(), of.free_of_owned if of.prescribed else None, True)
 
     def weights(self) -> tuple[Ints, Ints, Array]:
         """Indices of contactors, followed global nodes and weights, ``(k,)`` each."""

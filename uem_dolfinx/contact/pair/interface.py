@@ -141,7 +141,7 @@ class Interface(Told):
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
         correction = np.zeros(self.points.shape)
-        if self.discretisation.at_feet:
+        if self.discretisation.traits.at_feet:
             correction = self.kinematics.gap_rows.normal_return(self.trial.active)
         if self.friction is not None:
             correction = correction + self.friction.return_vectors(self.trial)

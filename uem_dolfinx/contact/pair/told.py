@@ -197,7 +197,7 @@ class Told:
     @property
     def chained(self) -> bool:
         """Whether contactors may follow each other."""
-        return self.discretisation.chained or (self.tie is not None and self.tie.chained)
+        return self.discretisation.traits.chained or (self.tie is not None and self.tie.chained)
 
     @property
     def works(self) -> bool:

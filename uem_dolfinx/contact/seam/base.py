@@ -12,7 +12,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import ContactRows, Kinematics, Traction
+from uem_dolfinx.contact.seam.placement import ContactRows, Kinematics, Traction, Traits
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
@@ -43,7 +43,7 @@ class OnTarget:
         asked: whether any contactor on any rank was near the target in the last placement.
     """
 
-    ordered_by = -1
+    traits: Traits
 
     def __init__(
         self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf,

@@ -323,6 +323,24 @@ class Kinematics(Protocol):
         """Means of a field at contactors, and on the opposite side: indices, global nodes and weights of sum 1 (collective)."""
 
 
+class Traits(NamedTuple):
+    """Properties of a discretisation that no placement changes.
+
+    Attributes:
+        at_feet: whether contact forces act at the closest points of the projection.
+        pointwise: whether each contactor follows the point of the target below it, not a mean.
+        chained: whether contactors may follow each other.
+        two_pass: whether the target may be the contactor of another contact with these surfaces.
+        order: number of the order of bodies that the rows of this and other contacts respect; -1 without an order.
+    """
+
+    at_feet: bool
+    pointwise: bool
+    chained: bool
+    two_pass: bool
+    order: int = -1
+
+
 class Discretisation(Protocol):
     """Relates contactors to a target. It keeps closest points or segments for small sliding, and data of one step."""
 
@@ -339,24 +357,8 @@ class Discretisation(Protocol):
         """Local nodes that contactors may follow, repeated or not ``(k,)``."""
 
     @property
-    def two_pass(self) -> bool:
-        """Whether the target may be the contactor of another contact with these surfaces."""
-
-    @property
-    def pointwise(self) -> bool:
-        """Whether each contactor follows the point of the target below it, not a mean."""
-
-    @property
-    def at_feet(self) -> bool:
-        """Whether contact forces act at the closest points of the projection."""
-
-    @property
-    def ordered_by(self) -> int:
-        """Number of the order of bodies that the rows of this and other contacts respect; -1 without an order."""
-
-    @property
-    def chained(self) -> bool:
-        """Whether contactors may follow each other."""
+    def traits(self) -> Traits:
+        """Properties that no placement changes."""
 
     @property
     def prescribed(self) -> bool:

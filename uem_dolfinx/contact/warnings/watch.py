@@ -75,7 +75,7 @@ class WatchedContact(OfBothSides):
     @property
     def sees_corners(self) -> bool:
         """Whether convex corners of the target may penetrate facets between contactors."""
-        return self.pair.discretisation.at_feet and self.contactor.dim > 0
+        return self.pair.discretisation.traits.at_feet and self.contactor.dim > 0
 
     def edges_that_meet(self) -> Meeting | None:
         """Surfaces whose sharp edges may cross, in 3D; shared by contacts of the same surfaces (collective)."""

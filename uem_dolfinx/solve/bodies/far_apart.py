@@ -182,5 +182,5 @@ class FarApart:
 
 
 def _may_be_far(pair: Interface) -> bool:
-    measured = pair.discretisation.at_feet and getattr(pair.target, "measures", False)
+    measured = pair.discretisation.traits.at_feet and getattr(pair.target, "measures", False)
     return measured and pair.sliding == "finite" and pair.tie is None and not (pair.heats or pair.trial.has_law)

@@ -66,7 +66,7 @@ class OverConstraints:
         meets = found[:-1].reshape(meets.shape)
         self.shared = bool(found[-1])
         # bodies that follow each other in one order never follow each other mutually
-        ordered = np.array([pair.discretisation.ordered_by for pair in pairs])
+        ordered = np.array([pair.discretisation.traits.order for pair in pairs])
         one_order = (ordered[:, None] == ordered) & (ordered[:, None] != -1)
         both_ways = meets & meets.T & ~one_order
         # surfaces that are tied as a whole are never in contact; they share only edge nodes with other surfaces
@@ -74,7 +74,7 @@ class OverConstraints:
         refused = (both_ways & ~(tied[:, None] | tied)).any(axis=1)
         for pair, mutual, wrong in zip(pairs, both_ways.any(axis=1), refused):
             pair.mutual = bool(mutual)
-            if wrong and not pair.discretisation.two_pass:
+            if wrong and not pair.discretisation.traits.two_pass:
                 raise ConflictError(
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
                     "one of the two contacts, or give both coupling='node_to_surface'"
