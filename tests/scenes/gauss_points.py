@@ -59,9 +59,11 @@ class GaussPoints(OnTarget):
         self.weighted = np.einsum("mq,mqj,mji,mi->mqi", weight, phi, np.linalg.inv(M), D).reshape(-1, nc)
         self.area = config.add_at_owners(surface.nodes.ravel(), D.ravel()[:, None])[nodes, 0]
 
-    def with_friction(self, mu):
-        """There is none."""
-        raise InputError("Gauss points have no friction: leave it out")
+    def set(self, **changed):
+        """Without friction."""
+        if "cones" in changed:
+            raise InputError("Gauss points have no friction: leave it out")
+        super().set(**changed)
 
     def place(self, points, state):
         """Project contactors and Gauss points (collective)."""

@@ -139,7 +139,7 @@ class _Surface:
             opposite &= projection.facet >= 0
         area = np.where(opposite, size.ravel(), 0.0)
         gap = np.where(opposite, projection.gap, 0.0)
-        if (offset := contact.pair.discretisation.offset) is not None:
+        if (offset := contact.pair.discretisation.setting.offset) is not None:
             of_nodes = np.zeros((config.n_owned, 1))
             of_nodes[contact.pair.nodes, 0] = offset
             gap = gap - (self._of_nodes(of_nodes) @ N.T).ravel()

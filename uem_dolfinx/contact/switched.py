@@ -66,16 +66,16 @@ def hold(pair: Interface, free: Bools, changed: Bools | None) -> None:
     config, own, tie = pair.config, pair.discretisation, pair.tie
     tied = tie is not None and bool(reduced(config.comm, int(tie.tied.sum())))
     with agreed(config.comm):
-        if not hasattr(own, "hold"):
+        if not hasattr(own, "set"):
             raise InputError(
-                f"{pair.name}: its discretisation {type(own).__name__} has no method hold, and takes no other conditions: give it one, or "
+                f"{pair.name}: its discretisation {type(own).__name__} has no method set, and takes no other conditions: give it one, or "
                 "keep the conditions of all steps"
             )
     if tie is not None and tie.knows_conditions and tied and changed is not None:
         _refuse_at_ties(tie, changed)
     if tie is not None and tie.means is not None:
-        tie.means.hold(free)
-    own.hold(free)
+        tie.means.set(free=free)
+    own.set(free=free)
     if pair.friction is not None:
         pair.friction.free = free[pair.nodes]
     if tied and changed is None:

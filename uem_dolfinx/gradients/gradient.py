@@ -205,7 +205,9 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
                 "chords=False"
             )
         refuse_assembly(problem, recorded)
-        if any(not keeps_distance(contact) and contact.pair.discretisation.offset is not None for contact in problem.contacts):
+        if any(
+            not keeps_distance(contact) and contact.pair.discretisation.setting.offset is not None for contact in problem.contacts
+        ):
             raise InputError(
                 "gradients at an offset need a rigid plane, sphere or cylinder: gaps from other surfaces are distances on these alone"
             )

@@ -143,7 +143,7 @@ class History(given.Sealed):
             motions=problem.rigid_motions(),
             values=[np.array(forms.values_of(m)) for m in self._inputs],
             friction=[None if pair.friction is None else pair.friction.value for pair in problem.pairs],
-            offsets=[pair.discretisation.offset for pair in problem.pairs],
+            offsets=[pair.discretisation.setting.offset for pair in problem.pairs],
             shares=shares,
             held=held,
             dt=0.0 if dynamics is None else dynamics.dt,
@@ -184,7 +184,7 @@ class History(given.Sealed):
         self._refuse_moved_nodes()
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
         values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
-        offsets, told = [pair.discretisation.offset for pair in problem.pairs], Prescribed.of(problem)
+        offsets, told = [pair.discretisation.setting.offset for pair in problem.pairs], Prescribed.of(problem)
         sweep = Sweep(problem, some)
         try:
             begun = False
@@ -303,10 +303,10 @@ class History(given.Sealed):
             forms.values_of(m)[...] = value
         for pair, mu, offset in zip(self.problem.pairs, friction, offsets):
             if pair.friction is not None and mu is not None:
-                pair.discretisation.with_friction(pair.friction.limits.change(mu))
-            there = pair.discretisation.offset
+                pair.discretisation.set(cones=pair.friction.limits.change(mu))
+            there = pair.discretisation.setting.offset
             if there is not offset and (there is None or offset is None or not np.array_equal(there, offset)):
-                pair.discretisation.set_offset(offset)
+                pair.discretisation.set(offset=offset)
 
     def _place(self, record: Record) -> None:
         """Set the problem to the end of a recorded step, before its commit (collective)."""
@@ -413,7 +413,7 @@ def _check_friction(problem: UnitedProblem, contact: Any) -> None:
         (contact.normals != "facet", "normals='facet'"),
         (type(law) is not Coulomb or law.per_area or law.per_point or follows_load(law), "Coulomb's law, without limit or load"),
         (pair.friction.wear is not None, "no wear"),
-        (pair.discretisation.offset is not None, "no offset and no adjust"),
+        (pair.discretisation.setting.offset is not None, "no offset and no adjust"),
         (not keeps_distance(contact), "a rigid plane, sphere or cylinder"),
     ):
         if wrong:

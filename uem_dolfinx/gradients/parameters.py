@@ -90,14 +90,14 @@ def thickened(pair: Interface, multipliers: Array, along: Array | None = None) -
     """
     d, kinematics = pair.discretisation, pair.kinematics
     more = THICKER * float(reduced(pair.config.comm, _least_side(pair), op=MPI.MIN))
-    before, length = d.offset, pair.kinematics.gap_rows.scale
+    before, length = d.setting.offset, pair.kinematics.gap_rows.scale
     try:
         gap, forces = _gaps_and_forces(pair, multipliers, length, along)
-        d.set_offset(np.full(len(pair.nodes), more) + (0.0 if before is None else before))
+        d.set(offset=np.full(len(pair.nodes), more) + (0.0 if before is None else before))
         pair.project()
         other_gap, other_forces = _gaps_and_forces(pair, multipliers, length, along)
     finally:
-        d.set_offset(before)
+        d.set(offset=before)
         pair.kinematics = kinematics
     return (other_gap - gap) / more, (forces - other_forces) / more
 

@@ -59,7 +59,7 @@ class EdgeKinematics(PlacedOnTarget):
         }  # fmt: skip
         projection = of.raised(target.nowhere(points).with_rows(which, crossing))
         movable = np.ones(n, bool)
-        if of.prescribed:
+        if of.setting.prescribed:
             parts = _moves_along(of, np.concatenate([at.nodes, at.followed], axis=1), gaps.normal)
             weights = np.abs(np.concatenate(gaps.weights, axis=1))
             movable[which] = (weights * parts).max(axis=1, initial=0.0) > MOSTLY_PRESCRIBED
@@ -88,7 +88,7 @@ class EdgeKinematics(PlacedOnTarget):
     def ties(self) -> Ties:
         """Weights of the other nodes of both edges."""
         of = self.of
-        return Ties.of(of.config, of.nodes, self._terms, of.free_of_owned if of.prescribed else None, False)
+        return Ties.of(of.config, of.nodes, self._terms, of.setting.free if of.setting.prescribed else None, False)
 
     @property
     def force_per_multiplier(self) -> Array:
@@ -173,5 +173,5 @@ class EdgeKinematics(PlacedOnTarget):
 
 def _moves_along(of: OnTarget, nodes: Ints, normal: Array) -> Array:
     """Lengths of the free parts of ``normal (k, gdim)`` at global ``nodes (k, m)``: ``(k, m)`` (collective)."""
-    free = of.config.ask_owners(nodes.ravel(), of.free_of_owned.astype(float)).reshape(*nodes.shape, of.config.gdim)
+    free = of.config.ask_owners(nodes.ravel(), of.setting.free.astype(float)).reshape(*nodes.shape, of.config.gdim)
     return np.asarray(np.linalg.norm(free * normal[:, None], axis=2))

@@ -82,7 +82,7 @@ class Sliding:
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set the law and the values of its parameter ``(n,)``."""
-        self.discretisation.with_friction(self.limits.set(law, value))
+        self.discretisation.set(cones=self.limits.set(law, value))
 
     @property
     def value(self) -> Array:
@@ -100,7 +100,7 @@ class Sliding:
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
         self.limits.grow(kinematics)
         if (value := self._value_now(kinematics)) is not None:
-            self.discretisation.with_friction(self.limits.change(value))
+            self.discretisation.set(cones=self.limits.change(value))
         self.replace(kinematics)
 
     def replace(self, kinematics: Kinematics) -> None:
@@ -112,7 +112,7 @@ class Sliding:
             assert self._last is not None
             way = self._last.ties
             away = way.relative(self._way_since(self._last))
-        self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.prescribed)
+        self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.setting.prescribed)
         if of_rate(self.limits.law):
             self.limits.see(np.linalg.norm(self.frame.slip, axis=1) / kinematics.force_per_multiplier)
 

@@ -105,13 +105,13 @@ class Mortar(Contactors):
             # forces and their reactions lie on one line through the contactor
             seen = seen.with_rows(np.flatnonzero(rows.covered), {"foot": points[rows.covered]})
         movable = np.linalg.norm(seen.normal * self.free, axis=1) > MOSTLY_PRESCRIBED
-        if self.prescribed:
+        if self.setting.prescribed:
             movable |= self._can_move(rows.plain)
         return MortarKinematics(self, points, seen, nearest, gap, rows, movable)
 
     def _can_move(self, equations: UnitingEquations) -> Bools:
         """Contactors whose equations contain a free component of a followed node (collective)."""
-        free = self.config.ask_owners(equations.followed, self.free_of_owned.astype(float))
+        free = self.config.ask_owners(equations.followed, self.setting.free.astype(float))
         can = np.zeros(len(equations), dtype=bool)
         can[equations.row[np.abs(equations.coefficients * free).max(axis=1, initial=0.0) > MOSTLY_PRESCRIBED]] = True
         return can
@@ -236,10 +236,11 @@ class Mortar(Contactors):
         equations, length = self.elimination.derivatives(rows.plain, variation)
         return replace(kinematics, rows=replace(rows, equations=equations, length=length))
 
-    def set_offset(self, offset: Array | None) -> None:
-        """Set offsets ``(n,)``; contactors must be placed again."""
-        super().set_offset(offset)
-        self._united = None
+    def set(self, **changed: Any) -> None:
+        """See ``OnTarget`` (collective)."""
+        super().set(**changed)
+        if "offset" in changed:
+            self._united = None
 
     def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
         """Segments against a mesh (collective)."""
@@ -330,7 +331,7 @@ class Mortar(Contactors):
             equations, length = self.elimination.derivatives(plain, variation)
         share = np.where(is_covered, size / scale, 1.0)
         weights = frictionless = slope = push = whole = None
-        if self.frictional:
+        if self.setting.cones is not None:
             along = self.elimination.of_themselves(plain, variation)
             slope = np.linalg.norm(along, axis=1)
             pushed = np.linalg.norm([plain_parts[f, i], parts[f, i]], axis=2).T

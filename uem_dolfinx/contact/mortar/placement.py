@@ -122,7 +122,7 @@ class MortarKinematics(PlacedOnTarget):
         """Weights are integrals of dual functions times shape functions of both sides, over the integral of the contactor's own."""
         of = self.of
         assert self.rows.weights is not None
-        return Ties.of(of.config, of.nodes, self.rows.weights, of.free_of_owned if of.prescribed else None, False)
+        return Ties.of(of.config, of.nodes, self.rows.weights, of.setting.free if of.setting.prescribed else None, False)
 
     @property
     def force_per_multiplier(self) -> Array:

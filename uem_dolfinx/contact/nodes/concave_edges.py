@@ -1,6 +1,6 @@
 """Change of facet by contactors on targets with discontinuous normals: crossing of edges, entering and leaving of corners.
 
-States are arguments and results; only the geometry of the target is stored.
+States are arguments and results; nothing is stored.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.nodes.corners import find_corners
+from uem_dolfinx.contact.seam.base import OnTarget
 from uem_dolfinx.contact.seam.corners import Corners
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
+from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.parallel import reduced
 
@@ -31,26 +31,15 @@ SHARP = 0.5
 MOST_CHANGES = 8
 
 
-def create_concave_edges(config: Configuration, target: Target, free: Bools) -> ConcaveEdges | None:
-    """Tracking of contactors from facet to facet; None for targets with continuous normals."""
-    return ConcaveEdges(config, cast("MeshTarget", target), free) if target.faceted else None
-
-
 class ConcaveEdges:
     """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its concave edges.
 
     Args:
-        config: configuration of the displacement.
-        target: target of the contactors.
-        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
+        of: discretisation of the contactors, on such a target.
     """
 
-    def __init__(self, config: Configuration, target: MeshTarget, free: Bools):
-        self.config, self.target, self.free = config, target, free
-        #: Coefficients of friction of the contactors ``(n,)``.
-        self.mu: Array = np.zeros(len(free))
-        #: Distance from the facets at which contactors are held ``(n,)``; None without offset.
-        self.offset: Array | None = None
+    def __init__(self, of: OnTarget):
+        self._of, self.config, self.target = of, of.config, cast("MeshTarget", of.target)
 
     def place(self, nearest: Projection, points: Array, state: PairState) -> tuple[Projection, Corners | None]:
         """Project contactors held in corners onto these; contactors that change facets too often get averaged normals (collective).
@@ -92,7 +81,7 @@ class ConcaveEdges:
             own = self.target.project_on(points[i], state.facet[i])
             own = replace(own, normal=self.target.outward(own))
             height = np.einsum("ng,ng->n", own.normal, points[i] - own.foot)
-            own = replace(own, gap=height if self.offset is None else height - self.offset[i])
+            own = replace(own, gap=height if self._of.offset is None else height - self._of.offset[i])
             nearest = nearest.with_those(i, own)
         return nearest, *self.place(nearest, points, state)
 
@@ -106,11 +95,12 @@ class ConcaveEdges:
         Returns:
             The new state, and contactors that have left a facet ``(n,)``.
         """
-        left = np.zeros(len(self.free), dtype=bool)
+        left = np.zeros(len(state.active), dtype=bool)
         if corners is None or not len(corners.which):
             return state, left
         i = corners.which
-        pulls = corners.pulls(state.force[i], self.mu[i])
+        cones = self._of.setting.cones
+        pulls = corners.pulls(state.force[i], np.zeros(len(i)) if cones is None else cones[i])
         leaving = (pulls < 0).any(axis=1) | ~state.active[i]
         facets = np.column_stack([state.facet[i], state.held[i]])
         rows = np.flatnonzero(leaving)
@@ -169,12 +159,12 @@ class ConcaveEdges:
     def _corners_of(self, state: PairState, points: Array, which: Ints, others: Ints) -> Corners | None:
         """Corners between the facet of some contactors and other facets ``(k, gdim - 1)`` (collective)."""
         c = find_corners(self.config.comm, self.target, points[which], which, np.column_stack([state.facet[which], others]))
-        return c if c is None or self.offset is None else replace(c, offset=self.offset[which])
+        return c if c is None or self._of.offset is None else replace(c, offset=self._of.offset[which])
 
     def _can_be_held(self, c: Corners) -> Bools:
         """Corners whose contactor has a free direction for every facet ``(k,)``."""
         asked = np.arange(self.config.gdim) < c.count[:, None]
-        A = np.where(asked[:, :, None], c.axes * self.free[c.which][:, None, :], 0.0)
+        A = np.where(asked[:, :, None], c.axes * self._of.free[c.which][:, None, :], 0.0)
         return (np.linalg.svd(A, compute_uv=False) > MOSTLY_PRESCRIBED).sum(axis=1) == c.count
 
 

@@ -49,38 +49,29 @@ class NodeToSurface(OnTarget):
     leaves_out: Callable[[FacetProjection], Bools] | None = None
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
-        self.concave_edges: ConcaveEdges | None = None
         super().__init__(config, nodes, target, **how)
         self.chords = chords
-        from uem_dolfinx.contact.nodes.concave_edges import create_concave_edges
-
-        self.concave_edges = create_concave_edges(config, target, self.free) if self.sliding == "finite" else None
 
     @classmethod
     def like(cls, other: OnTarget) -> NodeToSurface:
         """The same contactors and target with nodal gaps, for methods with nodal contact forces."""
         how: dict[str, Any] = {"sliding": other.sliding, "thickness": other.thickness}
-        return cls(other.config, other.nodes, other.target, free=other.free_of_owned, **how)
+        return cls(other.config, other.nodes, other.target, free=other.setting.free, **how)
 
-    def hold(self, free: Bools) -> None:
-        """Set components without Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
-        super().hold(free)
+    @property
+    def concave_edges(self) -> ConcaveEdges | None:
+        """Tracking of contactors from facet to facet; None for targets with continuous normals."""
+        if self.sliding != "finite" or not self.target.faceted:
+            return None
+        from uem_dolfinx.contact.nodes.concave_edges import ConcaveEdges
+
+        return ConcaveEdges(self)
+
+    def set(self, **changed: Any) -> None:
+        """See ``OnTarget`` (collective)."""
+        super().set(**changed)
         #: Followed nodes of the last call ``(n, nt)``, and their free components ``(n, nt, gdim)``.
         self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
-        if self.concave_edges is not None:
-            self.concave_edges.free = self.free
-
-    def set_offset(self, offset: Array | None) -> None:
-        """Set offsets ``(n,)``, also at corners; contactors must be placed again."""
-        super().set_offset(offset)
-        if self.concave_edges is not None:
-            self.concave_edges.offset = offset
-
-    def with_friction(self, mu: Array) -> None:
-        """Set the slopes of the cones ``(n,)``, also for contactors that leave corners."""
-        super().with_friction(mu)
-        if self.concave_edges is not None:
-            self.concave_edges.mu = mu
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
@@ -97,7 +88,7 @@ class NodeToSurface(OnTarget):
                 nearest = projection = self.take_feet(points)
             else:
                 nearest = projection = self.on_target(points, self.anchor)
-        moves = self._target_moves(projection) if self.prescribed else None
+        moves = self._target_moves(projection) if self.setting.prescribed else None
         out = None if self.leaves_out is None else self.leaves_out(cast("FacetProjection", nearest))
         return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves, out=out), state)
 
@@ -135,7 +126,7 @@ class NodeToSurface(OnTarget):
         nodes = np.maximum(p.nodes, 0)
         if reduced(self.config.comm, int(not np.array_equal(nodes, self._followed))):
             self._followed, shape = nodes, (*nodes.shape, self.config.gdim)
-            self._may_move = self.config.ask_owners(nodes.ravel(), self.free_of_owned.astype(float)).reshape(shape)
+            self._may_move = self.config.ask_owners(nodes.ravel(), self.setting.free.astype(float)).reshape(shape)
         free = self._may_move
         return np.abs(p.weights[:, :, None] * p.normal[:, None] * free).max(axis=(1, 2)) > MOSTLY_PRESCRIBED
 
@@ -167,7 +158,7 @@ class NodalKinematics(PlacedOnTarget):
     def ties(self) -> Ties:
         """Weights are the shape functions at the closest points; see ``Kinematics``."""
         of = self.of
-        return Ties.of(of.config, of.nodes, self.weights(), of.free_of_owned if of.prescribed else None, True)
+        return Ties.of(of.config, of.nodes, self.weights(), of.setting.free if of.setting.prescribed else None, True)
 
     def weights(self) -> tuple[Ints, Ints, Array]:
         """Indices of contactors, followed global nodes and weights, ``(k,)`` each."""
@@ -184,7 +175,12 @@ class NodalKinematics(PlacedOnTarget):
     def cone(self) -> Array:
         """Sum of facet forces over the force along the contactor's normal, above 1 on an edge ``(n,)`` (first time: collective)."""
         cone, target, p = np.ones(len(self.points)), self.of.target, self.projection
-        if self.of.frictional and target.faceted and isinstance(target, MeshTarget) and isinstance(p, FacetProjection):
+        if (
+            self.of.setting.cones is not None
+            and target.faceted
+            and isinstance(target, MeshTarget)
+            and isinstance(p, FacetProjection)
+        ):
             averaged = (p.facet >= 0) & (p.averaged == p.normal).all(axis=1)
             if reduced(self.of.config.comm, bool(averaged.any()), op=MPI.LOR):
                 cone = np.where(averaged, target.spread(p), 1.0)
@@ -196,19 +192,21 @@ class NodalKinematics(PlacedOnTarget):
 
     def placed_again(self, state: PairState) -> NodalKinematics:
         """Place contactors that have entered or left a corner (collective)."""
-        if self.of.concave_edges is None:
+        edges = self.of.concave_edges
+        if edges is None:
             return self
         left = np.zeros(len(self.points), dtype=bool) if self.left is None else self.left
-        nearest, projection, corners = self.of.concave_edges.place_again(self.nearest, left, self.points, state)
+        nearest, projection, corners = edges.place_again(self.nearest, left, self.points, state)
         there = replace(self, projection=projection, nearest=nearest, gap=projection.gap, corners=corners)
         return self.of.measured(there, state)
 
     def follow(self, state: PairState) -> tuple[NodalKinematics, PairState, bool]:
         """Follow contactors across edges, into and out of corners (collective)."""
-        if self.of.concave_edges is None:
+        edges = self.of.concave_edges
+        if edges is None:
             return self, state, False
-        state, left = self.of.concave_edges.leave(self.corners, state)
-        state, entered = self.of.concave_edges.follow(self.nearest, left, self.points, state)
+        state, left = edges.leave(self.corners, state)
+        state, entered = edges.follow(self.nearest, left, self.points, state)
         return replace(self, left=left), state, bool(left.any()) or entered
 
     # -- deciding quantities ---------------------------------------------------------------------------------------------

@@ -42,17 +42,17 @@ class JoinedNodes(NodeToSurface):
         self.far_of: Bools = np.zeros(len(own), dtype=bool)
         facets = JoinedFacets(first.config, surfaces)
         target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[self.label])
-        how: dict[str, Any] = {"free": first.free_of_owned, "sliding": first.sliding, "thickness": first.thickness}
+        how: dict[str, Any] = {"free": first.setting.free, "sliding": first.sliding, "thickness": first.thickness}
         super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
         self._own = own
         if any(one.offset is not None for one in own):
-            self.set_offset(np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
+            self.set(offset=np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
 
-    def hold(self, free: Bools) -> None:
-        """Set components without Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
-        super().hold(free)
-        for one in getattr(self, "_own", ()):
-            one.hold(free)
+    def set(self, **changed: Any) -> None:
+        """See ``OnTarget`` (collective)."""
+        super().set(**changed)
+        for one in getattr(self, "_own", ()) if "free" in changed else ():
+            one.set(free=changed["free"])
 
     @property
     def far(self) -> bool:  # type: ignore[override]

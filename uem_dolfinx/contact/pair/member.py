@@ -168,12 +168,12 @@ class Member(Interface):
 
     def set_offset(self, offset: Array | None) -> None:
         """Set offsets ``(n,)``; contactors must be placed again (collective)."""
-        self.discretisation.set_offset(offset)
+        self.discretisation.set(offset=offset)
         nodal = self.joined.discretisation
         every = np.zeros(len(nodal.nodes)) if nodal.offset is None else nodal.offset.copy()
         every[self._rows] = 0.0 if offset is None else offset
-        others = any(pair.discretisation.offset is not None for pair in self.joined.own)
-        nodal.set_offset(every if others else None)
+        others = any(pair.discretisation.setting.offset is not None for pair in self.joined.own)
+        nodal.set(offset=every if others else None)
 
     def know_friction(self, law: FrictionLaw, value: Array) -> None:
         """Set the friction law and parameter values ``(n,)`` of the committed state (collective)."""

@@ -92,7 +92,7 @@ class Told:
 
     def set_offset(self, offset: Array | None) -> None:
         """Set offsets ``(n,)``; contactors must be placed again (collective)."""
-        self.discretisation.set_offset(offset)
+        self.discretisation.set(offset=offset)
 
     def know_friction(self, law: FrictionLaw, value: Array) -> None:
         """Set the friction law and parameter values ``(n,)`` of the committed state (collective)."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import ContactRows, Kinematics, Traction, Traits
+from uem_dolfinx.contact.seam.placement import ContactRows, Kinematics, Setting, Traction, Traits
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
@@ -34,11 +34,8 @@ class OnTarget:
 
     Attributes:
         free: components without Dirichlet condition of the contactors ``(n, gdim)``.
-        free_of_owned: the same of all owned nodes ``(n_owned, gdim)``.
-        prescribed: whether any contactor on any rank has a Dirichlet condition.
-        frictional: whether there is friction.
+        setting: conditions, offset and friction of the contactors.
         anchor: projection whose closest points are kept, with small or fixed sliding.
-        offset: additional thickness of both surfaces together at the contactors ``(n,)``; None without offset.
         far: whether the surfaces are separated, so that contactors are skipped, see ``solve.bodies.far_apart``.
         asked: whether any contactor on any rank was near the target in the last placement.
     """
@@ -50,24 +47,29 @@ class OnTarget:
         contactor: Tag | None = None,
     ):  # fmt: skip
         self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
-        self.contactor, self.frictional = contactor, False
-        self.hold(free)
+        self.contactor = contactor
+        self.setting = Setting(free, False)
+        self.set(free=free)
         self.anchor: Projection | None = None
-        self.offset: Array | None = None
         self.far, self.asked = False, True
         #: Whether small sliding renews its closest points in the next step.
         self._renewing = False
         #: Last projection: positions of contactors and target, the anchor, and the result.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
 
-    def hold(self, free: Bools) -> None:
-        """Set the components of owned nodes without Dirichlet condition ``(n_owned, gdim)``; see ``Discretisation`` (collective)."""
-        self.free, self.free_of_owned = free[self.nodes], free
-        self.prescribed = bool(reduced(self.config.comm, int(not self.free.all())))
+    def set(self, **changed: Any) -> None:
+        """Set ``free``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
+        if "free" in changed:
+            self.free = changed["free"][self.nodes]
+            changed["prescribed"] = bool(reduced(self.config.comm, int(not self.free.all())))
+        if "offset" in changed:
+            self._projected = None
+        self.setting = replace(self.setting, **changed)
 
-    def with_friction(self, mu: Array) -> None:
-        """Prepare for friction; ``mu (n,)`` are the slopes of the contactors' cones."""
-        self.frictional = True
+    @property
+    def offset(self) -> Array | None:
+        """Additional thickness of both surfaces together at the contactors ``(n,)``; None without offset."""
+        return self.setting.offset
 
     @property
     def followed(self) -> Indices:
@@ -110,10 +112,6 @@ class OnTarget:
     def spread(self, values: Array) -> Array:
         """The shape functions themselves."""
         return values
-
-    def set_offset(self, offset: Array | None) -> None:
-        """Set offsets ``(n,)``; contactors must be placed again."""
-        self.offset, self._projected = offset, None
 
     def begin_step(self) -> None:
         """Begin a step: small sliding renews its closest points after every accepted step."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -341,12 +341,29 @@ class Traits(NamedTuple):
     order: int = -1
 
 
+@dataclass(frozen=True)
+class Setting:
+    """Conditions, offset and friction of the contactors of a discretisation, for all placements until a part is set anew.
+
+    Attributes:
+        free: components of all owned nodes without Dirichlet condition ``(n_owned, gdim)``.
+        prescribed: whether any contactor on any rank has a Dirichlet condition.
+        offset: heights minus gaps ``(n,)``; None without offset.
+        cones: slopes of the contactors' cones of friction ``(n,)``; None without friction.
+    """
+
+    free: Bools
+    prescribed: bool
+    offset: Array | None = None
+    cones: Array | None = None
+
+
 class Discretisation(Protocol):
     """Relates contactors to a target. It keeps closest points or segments for small sliding, and data of one step."""
 
     @property
-    def offset(self) -> Array | None:
-        """Heights minus gaps ``(n,)``; None without offset."""
+    def setting(self) -> Setting:
+        """Conditions, offset and friction of the contactors."""
 
     @property
     def target(self) -> Target:
@@ -360,26 +377,16 @@ class Discretisation(Protocol):
     def traits(self) -> Traits:
         """Properties that no placement changes."""
 
-    @property
-    def prescribed(self) -> bool:
-        """Whether any contactor on any rank has a Dirichlet condition."""
-
     #: Whether the surfaces are separated, so that contactors are skipped.
     far: bool
     #: Whether any contactor on any rank was near the target in the last placement; otherwise no other function is called.
     asked: bool
 
-    def with_friction(self, mu: Array) -> None:
-        """Prepare for friction; ``mu (n,)`` are the slopes of the contactors' cones."""
+    def set(self, **changed: Any) -> None:
+        """Set ``free``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
 
     def spread(self, values: Array) -> Array:
         """Integrals with non-negative functions, from integrals with the shape functions ``(n,)`` (collective)."""
-
-    def hold(self, free: Bools) -> None:
-        """Set the components of owned nodes without Dirichlet condition ``(n_owned, gdim)``; call ``place`` afterwards."""
-
-    def set_offset(self, offset: Array | None) -> None:
-        """Set heights minus gaps ``(n,)``; contactors must be placed again."""
 
     def begin_step(self) -> None:
         """Begin a step, or repeat it; contactors are placed again."""

@@ -41,7 +41,7 @@ class Bonds(Tie):
     def _make(self, which: Bools, off: Bools) -> None:
         if self.means is not None:
             # bonds to prescribed nodes open too
-            self.means.hold(np.ones((self.config.n_owned, self.config.gdim), dtype=bool))
+            self.means.set(free=np.ones((self.config.n_owned, self.config.gdim), dtype=bool))
         super()._make(which, off)
 
     def untie(self) -> None:

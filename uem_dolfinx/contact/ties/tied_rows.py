@@ -287,12 +287,12 @@ def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
         N: integrals of the functions of the contactor's basis times the target's shape functions, pair by pair ``(k, nn, nt)``.
     """
     at, config, g = rows.points, d.config, d.config.gdim
-    if not d.prescribed:
+    if not d.setting.prescribed:
         return [at.duals] * g
     covered, dofs, none = at.covered, d.surface.dofs[rows.facets], np.zeros(at.covered.D.shape, dtype=bool)
     part, ratio = d.covered_part(dofs, covered)
     first = d.precedence(ratio[dofs], dofs)
-    fixed = np.where(d.free_of_owned, 0.0, 1.0)
+    fixed = np.where(d.setting.free, 0.0, 1.0)
     theirs = config.ask_owners(at.opposite.ravel(), fixed).reshape(*at.opposite.shape, g)
     follows = np.abs(at.duals.A[at.facet] @ N) @ theirs
     follows = d.elimination.total(at.nodes[at.facet].ravel(), follows.reshape(-1, g))

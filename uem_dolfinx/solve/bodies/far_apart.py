@@ -100,7 +100,7 @@ class FarApart:
         """
         if not self._pairs:
             return
-        offsets = [pair.discretisation.offset for pair in self._pairs]
+        offsets = [pair.discretisation.setting.offset for pair in self._pairs]
         more = np.zeros((2, len(self._pairs)))
         more[0] = [0.0 if offset is None else offset.max(initial=0.0) for offset in offsets]
         # contacts with active contactors, or contactors past an end, are searched

@@ -80,7 +80,7 @@ class OverConstraints:
                     "one of the two contacts, or give both coupling='node_to_surface'"
                 )
         self.stacked = bool(meets.any()) or any(pair.chained for pair in whole)
-        self.contestable = self.shared or any(pair.discretisation.prescribed for pair in whole)
+        self.contestable = self.shared or any(pair.discretisation.setting.prescribed for pair in whole)
         if any(_united_fields(pair) for pair in pairs):
             # rows contain temperatures of both sides, which may be prescribed
             self.stacked = self.contestable = True
