@@ -62,7 +62,7 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     P = gathered_matrix(problem.system._rows().frictionless.P)[free]
     assert np.abs(rows @ P).max() <= 1e-13 and np.linalg.matrix_rank(P) == free.sum() - len(rows)
     problem.bodies.assemble()
-    share = placed.force_per_multiplier
+    share = placed.ties.share
     slipping = np.where(pair.friction.slipping(state)[:, None], state.friction.tau / share[:, None], 0.0)
     F = problem.bodies.residual.array_r[free] - problem.config.add_at_owners(*placed.ties.handed_on(slipping)).ravel()[free]
     found, *_ = np.linalg.lstsq(rows.T, F, rcond=None)

@@ -137,7 +137,7 @@ def test_friction_of_mortar_by_differences(cell, target, slips):
         problem.system.place()
         lam = pressure * pair.kinematics.rows.area
         pair.trial = replace(pair.trial, lam=lam)
-        size = mu * (lam if slips else held * pair.kinematics.force_per_multiplier)
+        size = mu * (lam if slips else held * pair.kinematics.ties.share)
         forces = []
         for tau in (-size[:, None] * pair.friction.directions(pair.trial), np.zeros((n, g))):
             pair.trial = replace(pair.trial, friction=replace(state, tau=tau))
@@ -148,7 +148,7 @@ def test_friction_of_mortar_by_differences(cell, target, slips):
     s = pair.friction.directions(pair.trial)
     friction(smooth, s)
     du = problem.config.vector(way[: problem.config.n_owned])
-    size = mu * (pair.trial.lam / pair.kinematics.force_per_multiplier if slips else held)
+    size = mu * (pair.trial.lam / pair.kinematics.ties.share if slips else held)
     tau = -size[:, None] * pair.friction.directions(pair.trial)
     made = contact_curvature(pair.kinematics.turning(pair.trial, np.arange(n), tau, np.full(n, not slips)), du) * du
     difference = friction(smooth + h * way, s) - friction(smooth - h * way, s)
@@ -216,7 +216,7 @@ def test_friction_of_degree_2_by_differences(cell, where, bound):
     s = pair.friction.directions(pair.trial)
     force(start, s)
     which = np.flatnonzero(touching)
-    tau = -mu * (pair.trial.lam / pair.kinematics.force_per_multiplier)[which, None] * s[which]
+    tau = -mu * (pair.trial.lam / pair.kinematics.ties.share)[which, None] * s[which]
     du = problem.config.vector(way[: problem.config.n_owned])
     made = contact_curvature(pair.kinematics.turning(pair.trial, which, tau), du) * du
     difference = force(start + h * way, s) - force(start - h * way, s)

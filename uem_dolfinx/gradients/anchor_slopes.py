@@ -49,7 +49,7 @@ class AnchorSlopes:
         self.stuck: Bools = active & state.friction.stick & ~pair.redundant & held
         self._slips = self._sliding.slipping(state)
         self._anchor, friction = self._tangents_at_anchors(), self._sliding
-        at_edges = self._slips & (pair.kinematics.pressure_map(False).force != pair.kinematics.force_per_multiplier)
+        at_edges = self._slips & (pair.kinematics.pressure_map(False).force != pair.kinematics.ties.share)
         self._refuse(active & (state.in_corner | friction.frame.cornered | at_edges), "corner of the target holds")
         self._refuse(self.stuck & friction.left_out.any(axis=1), "dependent equation along the target holds")
         if self._config.gdim == 3:

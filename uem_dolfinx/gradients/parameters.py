@@ -143,7 +143,7 @@ def _rubbed(pair: Interface) -> Array:
             f"{pair.name}: some contactors have no friction in a step, where the coefficient has a one-sided derivative: expected a "
             "positive coefficient everywhere"
         )
-    share = sliding.slipping(pair.trial) * pair.trial.lam / pair.kinematics.force_per_multiplier
+    share = sliding.slipping(pair.trial) * pair.trial.lam / pair.kinematics.ties.share
     return np.asarray(share[:, None] * sliding.directions(pair.trial))
 
 

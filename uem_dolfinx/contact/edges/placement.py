@@ -86,14 +86,9 @@ class EdgeKinematics(PlacedOnTarget):
 
     @cached_property
     def ties(self) -> Ties:
-        """Weights of the other nodes of both edges."""
-        of = self.of
-        return Ties.of(of.config, of.nodes, self._terms, of.setting.free if of.setting.prescribed else None, False)
-
-    @property
-    def force_per_multiplier(self) -> Array:
-        """One over the contactor's weight."""
-        return np.asarray(1.0 / self.share)
+        """Weights of the other nodes of both edges; multipliers are forces times the contactor's weight."""
+        of, free = self.of, self.of.setting.free if self.of.setting.prescribed else None
+        return Ties.of(of.config, of.nodes, self._terms, free, False, np.asarray(1.0 / self.share))
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 

@@ -49,10 +49,8 @@ class LastStep:
         ties: weights of followed nodes.
         x: positions of the owned nodes ``(n_owned, gdim)``.
         motion: of a rigid target; None if it had not moved.
-        force_per_multiplier: see ``Kinematics``.
     """
 
     ties: Ties
     x: Array
     motion: Motion | None
-    force_per_multiplier: Array

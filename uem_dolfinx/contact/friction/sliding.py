@@ -97,7 +97,7 @@ class Sliding:
             self._anchors, self._held_by = anchors_of(state, self.discretisation.target, self.config.gdim == 3)
         elif self._last is None:
             here = self.config.x[: self.config.n_owned].copy()
-            self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion, kinematics.force_per_multiplier)
+            self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion)
         self.limits.grow(kinematics)
         if (value := self._value_now(kinematics)) is not None:
             self.discretisation.set(cones=self.limits.change(value))
@@ -107,14 +107,18 @@ class Sliding:
         """Replace the kinematics at the same displacement (collective)."""
         if self.discretisation.traits.pointwise:
             way = None if self._held_by is None else Ties.of(self.config, self.nodes, self._held_by, None, True)
-            away = kinematics.points - self._anchors
+            away = self._points - self._anchors
         else:
             assert self._last is not None
             way = self._last.ties
             away = way.relative(self._way_since(self._last))
         self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.setting.prescribed)
         if of_rate(self.limits.law):
-            self.limits.see(np.linalg.norm(self.frame.slip, axis=1) / kinematics.force_per_multiplier)
+            self.limits.see(np.linalg.norm(self.frame.slip, axis=1) / kinematics.ties.share)
+
+    @property
+    def _points(self) -> Array:
+        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
 
     def _way_since(self, last: LastStep) -> Array:
         return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
@@ -231,7 +235,7 @@ class Sliding:
             enter: function that activates and releases contactors (collective).
         """
         assert isinstance(violated, stick_slip.FrictionViolations)
-        seen, pivot, share = violated.seen, self.pivot, kinematics.force_per_multiplier[:, None]
+        seen, pivot, share = violated.seen, self.pivot, kinematics.ties.share[:, None]
         tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, violated.driven
         space, size = self.config.gdim == 3 and self.discretisation.traits.pointwise, np.linalg.norm(seen.slip, axis=1)
         # a contactor whose slip reverses first slips the other way, since contactors would otherwise reverse one by one; at the
@@ -270,7 +274,7 @@ class Sliding:
             return state
         k, ties = np.abs(stiffness).mean(axis=1, keepdims=True), frame.ties
         c = stick_slip.slip_stiffness(k[self.nodes, 0], ties.row, ties.weight, self.config.ask_owners(ties.followed, k)[:, 0])
-        T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.force_per_multiplier[:, None]
+        T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.ties.share[:, None]
         # prescribed components at rest carry no friction; if all are prescribed, only the moving ones do
         told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
         least = GAP_ROUNDING * self.config.size
@@ -290,7 +294,7 @@ class Sliding:
             of_friction=self.active(state),
             stick=_of(state).stick,
             directions=self.directions(state),
-            slope=self._cone(state)[1] * kinematics.pressure_map(False).force / kinematics.force_per_multiplier,
+            slope=self._cone(state)[1] * kinematics.pressure_map(False).force / kinematics.ties.share,
             normal=kinematics.normal,
             pointwise=self.discretisation.traits.pointwise,
             keeps_ties=self.keeps_feet or self.discretisation.traits.at_feet,
@@ -307,7 +311,7 @@ class Sliding:
     ) -> Traction:
         """Normal and tangential forces from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
         across = kinematics.forces(state, equations, multipliers)
-        share, i = kinematics.force_per_multiplier, np.flatnonzero(equations.tangent >= 0)
+        share, i = kinematics.ties.share, np.flatnonzero(equations.tangent >= 0)
         limit = self._limit(state, across.lam) / share
         tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
         np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.rows.direction[i])
@@ -325,7 +329,7 @@ class Sliding:
     def known_forces(self, state: PairState, kinematics: Kinematics) -> tuple[Ints, Array]:
         """Friction forces independent of the normal force: nodes and forces (collective)."""
         rest, _ = self._cone(state)
-        size = np.where(self.slipping(state), rest / kinematics.force_per_multiplier, 0.0)
+        size = np.where(self.slipping(state), rest / kinematics.ties.share, 0.0)
         return self.frame.ties.handed_on(-size[:, None] * self.directions(state))
 
     @property
@@ -345,7 +349,7 @@ class Sliding:
         forwards = s[:, :, None] * s[:, None, :]
         sideways = np.einsum("krg,krh->kgh", T, T) - forwards
         sideways[~self.frame.free_tangents[i].any(axis=(1, 2))] = 0.0
-        share = kinematics.force_per_multiplier
+        share = kinematics.ties.share
         bound, _, rate = self.limits.of(state.lam, self.slipping(state))
         size = np.linalg.norm(self.pivot.q[i], axis=1)
         stiffness, part = stick_slip.turn_stiffness(size, (bound / share)[i], self.pivot.stiffness[i])
@@ -375,7 +379,7 @@ class Sliding:
         if not reduced(self.config.comm, len(which)):
             return []
         force = np.where(slips[:, None], -self._limit(state, state.lam)[:, None] * self.directions(state), _of(state).tau)
-        tau = (force / kinematics.force_per_multiplier[:, None])[which]
+        tau = (force / kinematics.ties.share[:, None])[which]
         return [(nodes, -blocks) for nodes, blocks in kinematics.turning(state, which, tau, held[which])]
 
     # -- from step to step -----------------------------------------------------------------------------------------------
@@ -386,11 +390,11 @@ class Sliding:
         if not self.discretisation.traits.pointwise:
             return f
         loose = ~f.stick | ~self.active(state) | self.frame.cornered
-        return anchored(f, kinematics, self.discretisation.target, kinematics.points, loose, self.keeps_feet)
+        return anchored(f, kinematics, self.discretisation.target, self._points, loose, self.keeps_feet)
 
     def commit(self, state: PairState, committed: PairState, kinematics: Kinematics) -> PairState:
         """The state to be committed, with slips, work and new anchors (collective)."""
-        share, f, held = kinematics.force_per_multiplier[:, None], self.anchored(state, kinematics), self.frame.cornered
+        share, f, held = kinematics.ties.share[:, None], self.anchored(state, kinematics), self.frame.cornered
         tau, start, end, taken = self.step(state, committed, kinematics)
         slips = self.slipping(state) if self.wear is None else state.active & ~f.stick
         slipped = f.slipped + np.where(held[:, None], end, np.where(slips[:, None], self.frame.slip / share, 0.0))
@@ -403,7 +407,7 @@ class Sliding:
 
     def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
         """Friction at a step's end, slips per unit of friction at start and end ``(n, gdim)``, and dissipation ``(n,)`` (collective)."""
-        share, held, (_, slope) = kinematics.force_per_multiplier[:, None], self.frame.cornered[:, None], self._cone(state)
+        share, held, (_, slope) = kinematics.ties.share[:, None], self.frame.cornered[:, None], self._cone(state)
         # a contactor that stuck throughout the step is at its anchor, up to rounding
         stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
         start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
@@ -417,11 +421,11 @@ class Sliding:
 
     def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
         """Relative motions since the last step, per unit of friction at its start and at its end ``(n, gdim)`` (collective)."""
-        share = kinematics.force_per_multiplier[:, None]
+        share = kinematics.ties.share[:, None]
         if self._last is None:
             return (self.frame.away / share,) * 2
         now = kinematics.ties.relative(self._way_since(self._last))
-        return self.frame.away / self._last.force_per_multiplier[:, None], now / share
+        return self.frame.away / self._last.ties.share[:, None], now / share
 
 
 def _of(state: PairState) -> FrictionState:

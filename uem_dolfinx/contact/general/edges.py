@@ -11,6 +11,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.edges.discretisation import Edges, EdgeTarget
+from uem_dolfinx.contact.edges.placement import EdgeKinematics
 from uem_dolfinx.contact.general.parts import BodiesContact
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.edge_crossings import Crossings, SharpLines
@@ -41,7 +42,9 @@ class EdgeContact(BodiesContact):
 
     def acting_at(self) -> Array:
         """Crossings."""
-        return self.pair.kinematics.points
+        kinematics = self.pair.kinematics
+        assert isinstance(kinematics, EdgeKinematics)
+        return kinematics.points
 
     def edges_that_meet(self) -> None:
         """None: the contacts of nodes look for edges that cross."""

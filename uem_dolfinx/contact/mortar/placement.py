@@ -120,15 +120,11 @@ class MortarKinematics(PlacedOnTarget):
     @cached_property
     def ties(self) -> Ties:
         """Weights are integrals of dual functions times shape functions of both sides, over the integral of the contactor's own."""
-        of = self.of
-        assert self.rows.weights is not None
-        return Ties.of(of.config, of.nodes, self.rows.weights, of.setting.free if of.setting.prescribed else None, False)
-
-    @property
-    def force_per_multiplier(self) -> Array:
-        """Relative to the sum of the facets' forces, each along its own derivative of the gap."""
-        assert self.rows.push is not None
-        return np.asarray(self.rows.share / self.rows.push)
+        of, rows = self.of, self.rows
+        assert rows.weights is not None and rows.push is not None
+        # relative to the sum of the facets' forces, each along its own derivative of the gap
+        share = np.asarray(rows.share / rows.push)
+        return Ties.of(of.config, of.nodes, rows.weights, of.setting.free if of.setting.prescribed else None, False, share)
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 

@@ -184,7 +184,7 @@ class ControlKinematics(NodalKinematics):
         )
 
     @property
-    def force_per_multiplier(self) -> Array:
+    def _share(self) -> Array:
         """Bernstein basis functions over the functions of the scaled gaps."""
         return np.asarray(self.control.basis.scale)
 
@@ -201,7 +201,7 @@ class ControlKinematics(NodalKinematics):
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Map of control forces, which are integrals with the Bernstein basis."""
-        return PressureMap(self.cone * self.force_per_multiplier, self.control.basis)
+        return PressureMap(self.cone * self._share, self.control.basis)
 
 
 def _family(config: Configuration, nodes: Indices) -> tuple[Ints, Ints, Array, Bools]:

@@ -158,7 +158,7 @@ class NodalKinematics(PlacedOnTarget):
     def ties(self) -> Ties:
         """Weights are the shape functions at the closest points; see ``Kinematics``."""
         of = self.of
-        return Ties.of(of.config, of.nodes, self.weights(), of.setting.free if of.setting.prescribed else None, True)
+        return Ties.of(of.config, of.nodes, self.weights(), of.setting.free if of.setting.prescribed else None, True, self._share)
 
     def weights(self) -> tuple[Ints, Ints, Array]:
         """Indices of contactors, followed global nodes and weights, ``(k,)`` each."""
@@ -167,8 +167,8 @@ class NodalKinematics(PlacedOnTarget):
         return row.astype(np.int64), p.nodes[row, a], p.weights[row, a]
 
     @property
-    def force_per_multiplier(self) -> Array:
-        """One, since multipliers are forces ``(n,)``."""
+    def _share(self) -> Array:
+        """Forces over multipliers ``(n,)``: one."""
         return np.ones(len(self.points))
 
     @cached_property

@@ -175,7 +175,7 @@ class PlacedOnTarget:
 
     def forces(self: Kinematics, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
         """Forces of the rows at both bodies, where contactors follow each other too (collective)."""
-        of, mu = self.gap_rows, np.zeros(len(self.points))
+        of, mu = self.gap_rows, np.zeros(len(self.gap))
         mu[rows.contactor[rows.normal]] = multipliers[rows.normal]
         force = np.asarray(of.config.add_at_owners(*of.forces(mu))[of.equations.node])
         lam = mu * self.pressure_map(False).force
@@ -191,5 +191,5 @@ class PlacedOnTarget:
         nodes, forces = self.gap_rows.forces(state.lam / self.pressure_map(False).force)
         if state.friction is None:
             return nodes, forces
-        along = self.ties.handed_on(state.friction.tau / self.force_per_multiplier[:, None])
+        along = self.ties.handed_on(state.friction.tau / self.ties.share[:, None])
         return np.concatenate([nodes, along[0]]), np.concatenate([forces, along[1]])

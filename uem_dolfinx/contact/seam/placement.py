@@ -233,10 +233,6 @@ class Kinematics(Protocol):
     """Position of contactors relative to their target, in one state and at one displacement; immutable."""
 
     @property
-    def points(self) -> Array:
-        """Current positions of the contactors ``(n, gdim)``."""
-
-    @property
     def projection(self) -> Projection:
         """Projection of the contactors; onto the corner for contactors held by one."""
 
@@ -263,10 +259,6 @@ class Kinematics(Protocol):
     @property
     def ties(self) -> Ties:
         """Weights by which contactors follow other nodes, and their relative motion (first time: collective)."""
-
-    @property
-    def force_per_multiplier(self) -> Array:
-        """Friction ``tau`` over the multipliers of tangential equations ``(n,)`` (first time: collective)."""
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 

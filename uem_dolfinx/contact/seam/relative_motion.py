@@ -28,6 +28,7 @@ class Ties:
         weight: weight of this node ``(k,)``.
         moves: components of the relative motion not prescribed by Dirichlet conditions ``(n, gdim)``.
         held: weights for the prescribed components ``(k, gdim)``; None if equal to ``weight``.
+        share: friction over the multipliers of tangential equations ``(n,)``.
     """
 
     config: Configuration
@@ -37,10 +38,17 @@ class Ties:
     weight: Array
     moves: Bools
     held: Array | None
+    share: Array
 
     @classmethod
     def of(
-        cls, config: Configuration, nodes: Indices, terms: tuple[Ints, Ints, Array], free: Bools | None, at_feet: bool
+        cls,
+        config: Configuration,
+        nodes: Indices,
+        terms: tuple[Ints, Ints, Array],
+        free: Bools | None,
+        at_feet: bool,
+        share: Array | None = None,
     ) -> Ties:
         """Ties with the weights ``terms`` (collective).
 
@@ -50,20 +58,22 @@ class Ties:
             terms: ``row``, ``followed`` and ``weight``.
             free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``; None if all contactors are free.
             at_feet: whether weights belong to points, not to means.
+            share: friction over the multipliers of tangential equations ``(n,)``; None for 1.
         """
         row, followed, weight = terms
+        share = np.ones(len(nodes)) if share is None else share
         if free is None:
-            return cls(config, nodes, row, followed, weight, np.ones((len(nodes), config.gdim), dtype=bool), None)
+            return cls(config, nodes, row, followed, weight, np.ones((len(nodes), config.gdim), dtype=bool), None, share)
         theirs = config.ask_owners(followed, free.astype(float))
         size = np.abs(weight)[:, None]
         of_free, of_held = (sums_of_rows(row, size * part, len(nodes)) for part in (theirs, 1.0 - theirs))
         others = of_free > MOSTLY_PRESCRIBED
         if at_feet:
-            return cls(config, nodes, row, followed, weight, free[nodes] | others, None)
+            return cls(config, nodes, row, followed, weight, free[nodes] | others, None, share)
         moves = free[nodes] | (others & (of_held <= MOST_HELD * (of_held + of_free)))
         part, whole = (sums_of_rows(row, weight[:, None] * w, len(nodes)) for w in (1.0 - theirs, np.ones_like(theirs)))
         ratio = np.where(moves | (part == 0.0), 1.0, whole / np.where(part == 0.0, 1.0, part))
-        return cls(config, nodes, row, followed, weight, moves, (weight[:, None] * (1.0 - theirs)) * ratio[row])
+        return cls(config, nodes, row, followed, weight, moves, (weight[:, None] * (1.0 - theirs)) * ratio[row], share)
 
     def relative(self, du: Array) -> Array:
         """Relative motion of contactors in an increment ``(n_owned, gdim)``: ``(n, gdim)`` (collective)."""

@@ -97,7 +97,7 @@ class _Slots:
         if friction is None:
             return np.zeros(len(i)), np.zeros(len(i))
         rest, slope = friction.limits.cone(pair.trial.lam, friction.slipping(pair.trial))
-        share = np.where(friction.value > 0, 1.0 / pair.kinematics.force_per_multiplier, 0.0)
+        share = np.where(friction.value > 0, 1.0 / pair.kinematics.ties.share, 0.0)
         return (slope * share * pair.kinematics.pressure_map(False).force)[i], (rest * share)[i]
 
     def take(self, active: Bools, stick: Bools, direction: Array, slip: Array, force: Array) -> None:
