@@ -292,7 +292,6 @@ def test_what_is_refused():
     one = uem.Contact(b.high, b.low, normal=soft)
     made = problem(one)
     run(made)
-    refused(uem.InputError, "soft contact", lambda: uem.gradient(made, b.u[1] * ufl.dx, b.u))
     explicit = uem.Dynamics(uem.lumped_mass(b.V, 1.0), scheme=uem.CentralDifferences())
     soft_one = uem.Contact(b.high, b.low, normal=soft)
     refused(uem.InputError, "CentralDifferences", lambda: problem(soft_one, dynamics=explicit))

@@ -44,9 +44,22 @@ def dot(a, b):
 
 
 def pressed(
-    cell, degree=1, coupling="node_to_surface", rigid=False, law="neo", measure="reference", comm=COMM, overhang=0.25, **options
+    cell,
+    degree=1,
+    coupling="node_to_surface",
+    rigid=False,
+    law="neo",
+    measure="reference",
+    comm=COMM,
+    overhang=0.25,
+    normal=None,
+    sliding="finite",
+    **options,
 ):
-    """A block with a bulging face, loaded and pressed onto another or onto a rigid ball, and all that its solution may depend on."""
+    """A block with a bulging face, loaded and pressed onto another or onto a rigid ball, and all that its solution may depend on.
+
+    ``normal``: a function of the mesh that returns a soft contact.
+    """
     bulge = 0.1 if degree == 1 else 0.0
     b = blocks(
         comm, cell, *((4, 6) if cell in ("triangle", "quadrilateral") else (2, 3)), overhang=overhang, degree=degree,
@@ -71,12 +84,15 @@ def pressed(
     elif rigid == "plane":
         target = uem.RigidPlane([0.4] * (g - 1) + [0.0], np.eye(g)[-1] + 0.02 * np.eye(g)[0])
     values = {"offset": 0.0, "place": np.zeros(g), "turn": np.zeros(() if g == 2 else 3)}
+    soft = None if normal is None else normal(mesh)
 
     def solve():
         u.x.array[:] = 0.0
         if rigid:
             target.move(values["place"], values["turn"])
-        contact = uem.Contact(b.high, target, coupling=coupling, measure=measure, offset=values["offset"])
+        contact = uem.Contact(
+            b.high, target, coupling=coupling, measure=measure, offset=values["offset"], sliding=sliding, normal=soft
+        )
         problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], rtol=1e-13, **options)
         run(problem)
         return problem
@@ -103,6 +119,7 @@ def pressed(
         u=u,
         v=v,
         values=values,
+        soft=soft,
     )
 
 

@@ -1,4 +1,4 @@
-"""Derivatives by parameters of equations, couplings, forces at nodes and preloads; and the values of these in recorded steps.
+"""Derivatives by parameters of equations, couplings, forces at nodes, preloads and soft laws; and the values of these in recorded steps.
 
 Right-hand sides of equations and prescribed motions change gaps of users' equations; forces at nodes and in sections change the residual.
 """
@@ -19,10 +19,16 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 def constants_of(problem: UnitedProblem) -> list[fem.Constant]:
-    """Constants in equations, couplings and forces at nodes, each once."""
+    """Constants in equations, couplings, forces at nodes and laws of soft contacts, each once."""
     values = [getattr(one, name, None) for one in (*problem.equations, *problem.points) for name in ("b", "force")]
     values += [value for one in _rigid(problem.couplings) for value in one.values_given()]
+    values += [value for contact in problem.contacts for value in constants_of_law(contact)]
     return list({id(one): one for one in values if isinstance(one, fem.Constant)}.values())
+
+
+def constants_of_law(contact: Contact) -> list[fem.Constant]:
+    """Constants in the law of a soft contact."""
+    return [] if contact.normal is None else contact.normal.constants
 
 
 def section_of(contact: Contact) -> Preloaded | None:
@@ -32,7 +38,7 @@ def section_of(contact: Contact) -> Preloaded | None:
 
 
 class Users:
-    """Derivatives by Constants through equations, couplings and forces at nodes, at fixed displacement.
+    """Derivatives by Constants through equations, couplings, forces at nodes and laws of soft contacts, at fixed displacement.
 
     Args:
         problem: in the state of the derivatives.
@@ -56,6 +62,9 @@ class Users:
         problem, pushed = self._problem, np.zeros((self._problem.config.n_owned, self._problem.config.gdim))
         if problem.bodies.points is not None:
             pushed = -_difference(m, change, problem.bodies.points.loads)
+        for contact in problem.contacts:
+            if any(m is one for one in constants_of_law(contact)):
+                pushed = pushed + float(change) * contact.pair.pushed_by(m)  # type: ignore[attr-defined]
         parts = [] if problem.linear is None else problem.linear.parts
         gaps = [one.opened(_difference(m, change, one.values), self._share) for one in parts]
         found = np.concatenate([np.zeros(0), *gaps])

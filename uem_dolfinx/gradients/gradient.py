@@ -27,7 +27,7 @@ from uem_dolfinx.gradients.assemblies import constants_of
 from uem_dolfinx.gradients.contact_fields import check_field, fields_of
 from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.gradients.places import Places
-from uem_dolfinx.gradients.refused import refuse_assembly, refuse_parameter, refuse_shape
+from uem_dolfinx.gradients.refused import refuse_assembly, refuse_parameter, refuse_shape, refuse_soft
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.loading import holds, rules_of, set_by
@@ -54,7 +54,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
             reaction of Dirichlet conditions, or the force of contacts, on a part is a functional of ``problem.u``:
             ``ufl.replace(F, {v: w})`` with a Function w that is a unit vector at the part's nodes, 0 elsewhere.
         controls: Constants and Functions in F, J or the values of Dirichlet conditions: moduli, loads, fields of moduli, prescribed
-            displacements; Constants in equations, couplings and forces at nodes. The entries of a Function are its degrees of freedom.
+            displacements; Constants in equations, couplings, forces at nodes and laws of soft contacts. The entries of a Function are
+            its degrees of freedom.
             ``ufl.SpatialCoordinate(mesh)`` is the shape: the positions of the nodes.
             A ``ContactParameter`` is the offset of a contact, the position or rotation of its rigid target, or the force of a preload.
 
@@ -193,8 +194,8 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             raise InputError("a gradient needs the derivative of F: expected J = None")
         if any(contact.heats for contact in problem.contacts):
             raise InputError("gradients do not support heat conducted through a contact: expected contacts without heat")
-        if any(contact.normal is not None for contact in problem.contacts):
-            raise InputError("gradients do not support soft contact: expected normal = None, hard contact")
+        for contact in problem.contacts:
+            refuse_soft(contact)
         if any(contact.cohesion is not None for contact in problem.contacts):
             raise InputError("gradients do not support cohesion: expected cohesion = None")
         if any(contact.leak is not None for contact in problem.contacts):
@@ -276,6 +277,11 @@ def _check_results(problem: UnitedProblem, J: ufl.Form) -> list[Contact]:
                 )
     found = [contact for contact, p in zip(problem.contacts, pressures) if any(f is p for f in results)]
     with agreed(problem.comm):
+        if soft := [contact.name for contact in found if contact.normal is not None]:
+            raise InputError(
+                f"J holds the pressure of '{soft[0]}', a soft contact, whose pressures have no derivatives here: expected forces: the "
+                "residual with a Function in place of its test function"
+            )
         if tied := [contact.name for contact in found if contact.tied]:
             raise InputError(
                 f"J holds the pressure of '{tied[0]}', which is tied, and whose pressures have no derivatives here: expected pressures of "

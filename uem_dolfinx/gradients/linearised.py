@@ -56,7 +56,7 @@ from uem_dolfinx.gradients.shape_slopes import ShapeSlopes, shape_slopes_of
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.norms import ratio
-from uem_dolfinx.solve.bodies.tangent import curvature_of, together
+from uem_dolfinx.solve.bodies.tangent import curvature_of, slip_terms, together
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.taken import in_rows, uniform, wanted_by_step
 from uem_dolfinx.solve.united.rows import BodyState, Rows
@@ -241,7 +241,13 @@ class Linearised:
 
     def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
         """Derivative of the forces of contacts with these numbers with the displacement, with the opposite sign (collective)."""
-        return curvature_of(in_question([self.problem.pairs[k] for k in which]), self.config.unknowns.vector(), True, False)
+        pairs, like = in_question([self.problem.pairs[k] for k in which]), self.config.unknowns.vector()
+        return together(curvature_of(pairs, like, True, False), self.stiffness_of_gaps(which))
+
+    def stiffness_of_gaps(self, which: Sequence[int]) -> PETSc.Mat | None:
+        """Stiffness of the gaps of soft contacts with these numbers (collective)."""
+        pairs = [pair for pair in in_question([self.problem.pairs[k] for k in which]) if pair.trial.has_law]
+        return slip_terms(pairs, self.config.unknowns.vector())[0]
 
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``a = Q mu`` of the adjoint problem under forces (collective)."""

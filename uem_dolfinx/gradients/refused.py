@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from uem_dolfinx.conditions.equation import Equation, Periodic
+from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.gradients.parameters import ContactParameter
@@ -40,6 +41,28 @@ def refuse_assembly(problem: UnitedProblem, recorded: bool) -> None:
         )
 
 
+def refuse_soft(contact: Contact) -> None:
+    """Refuse soft contacts whose forces depend on changes of areas or on speeds, of which there are no derivatives (to be agreed on)."""
+    if contact.normal is None:
+        return
+    for there, what, expected in (
+        (contact.normal.damping, "damping", "no damping"),
+        (contact.measure == "current", "measure='current', whose areas change", "measure='reference'"),
+        (
+            contact.coupling == "mortar" and contact.sliding == "finite",
+            "coupling='mortar' and sliding='finite', whose areas change",
+            "sliding='small' or 'fixed', or coupling='node_to_surface'",
+        ),
+        (
+            contact.coupling == "mortar" and hasattr(contact.target, "project"),
+            "coupling='mortar' and a rigid target",
+            "coupling='node_to_surface'",
+        ),
+    ):
+        if there:
+            raise InputError(f"contact '{contact.name}': gradients do not support soft contact with {what}: expected {expected}")
+
+
 def refuse_shape(problem: UnitedProblem) -> None:
     """Refuse ties, preloads, equations and couplings without derivatives by the shape (to be agreed on)."""
     if problem.couplings:
@@ -54,6 +77,11 @@ def refuse_shape(problem: UnitedProblem) -> None:
                 "periodic"
             )
     for contact in problem.contacts:
+        if contact.normal is not None:
+            raise InputError(
+                f"contact '{contact.name}': there is no gradient by the shape with soft contact, whose areas change with it: expected "
+                "other controls"
+            )
         if not contact.tied:
             continue
         if contact.coupling != "node_to_surface" or not contact.pair.target.n_nodes:
@@ -79,7 +107,11 @@ def refuse_shape(problem: UnitedProblem) -> None:
 
 
 def refuse_parameter(m: ContactParameter, what: str) -> None:
-    """Refuse parameters that tied surfaces do not have."""
+    """Refuse parameters that tied surfaces do not have, and those by which soft contacts have no derivatives."""
+    if m.contact.normal is not None and m.parameter == "offset":
+        raise InputError(
+            f"{what} is the offset of contact '{m.contact.name}', which is soft: expected a Constant of its law, or place or turn"
+        )
     if m.contact.tied and m.parameter not in ("force", "shortening"):
         raise InputError(
             f"{what} is the {m.parameter} of contact '{m.contact.name}', which is tied: expected a contact that is not, or the force or "

@@ -269,13 +269,13 @@ class LinearisedStep(Linearised):
         for pair, own in zip(pairs, slopes):
             pair.trial = pair.trial if own is None else own.without_stuck()
         try:
-            curvature = curvature_of(in_question(pairs), like, any(self._slopes), False)
+            curvature = together(curvature_of(in_question(pairs), like, any(self._slopes), False), self.stiffness_of_gaps(which))
         finally:
             for pair, state in zip(pairs, states):
                 pair.trial = state
         if self.config.gdim == 2 or not any(slopes):
             return curvature
-        turned, _ = slip_terms(in_question(pairs), like)
+        turned, _ = slip_terms([pair for pair in in_question(pairs) if not pair.trial.has_law], like)
         leaning = contact_curvature([part for own in slopes if own is not None for part in own.leaning()], like)
         return together(together(curvature, turned), leaning)
 

@@ -15,6 +15,7 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.contact.laws.constants import checked
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import agreed, ask_together
 
@@ -62,9 +63,9 @@ class Conductance(given.Sealed):
     ):
         self.h = h if callable(h) else given.number("h", h, CONDUCTANCE)
         self.field = given.part_number("field", field, "the temperature")
-        self.temperature = temperature if temperature is None else _number("temperature", temperature, given.FINITE)
+        self.temperature = temperature if temperature is None else checked("temperature", temperature, given.FINITE)
         self.friction_share = friction_share if friction_share is None else given.number("friction_share", friction_share, SHARE)
-        self.dt = _number("dt", dt, given.POSITIVE)
+        self.dt = checked("dt", dt, given.POSITIVE)
         self.joule = None if joule is None else given.part_number("joule", joule, "the electric potential")
         self.joule_share = given.number("joule_share", joule_share, PART)
         self.of_field = None if of_field is None else given.part_number("of_field", of_field, "what h is a function of")
@@ -156,18 +157,6 @@ def one_of_fields(name: str, laws: Sequence[Conductance], field: Any) -> int:
         expected = f"one of {fields}" if fields else "a contact with heat=..."
         raise InputError(f"contact '{name}': no conductance is of field {given.shown(field)}: expected {expected}")
     return int(field)
-
-
-def value(number: float | fem.Constant) -> float:
-    """The present value of a number or a Constant."""
-    return float(number.value) if isinstance(number, fem.Constant) else number
-
-
-def _number(what: str, number: Any, within: given.Range) -> float | fem.Constant:
-    if isinstance(number, fem.Constant):
-        given.number(what, number.value, within)
-        return number
-    return given.number(what, number, within)
 
 
 def _n_needed(h: Callable[..., Any]) -> int:

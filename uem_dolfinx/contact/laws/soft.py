@@ -14,15 +14,17 @@ from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.laws.constants import checked
 from uem_dolfinx.contact.laws.linear import Linear
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import agreed, ask_together
 
-#: The pressure of a function is differentiated over so much of the gap.
-#: [derived; the gap; test_soft_laws.py::test_slopes_by_differences]
+#: The pressure of a function is differentiated over so much of the gap, and of a law over so much of the value of a Constant.
+#: [derived; the gap or the value; test_soft_laws.py::test_slopes_by_differences]
 OF_GAP = np.finfo(float).eps ** (1 / 3)
 
 
@@ -54,7 +56,7 @@ class _OfFunction:
 
 
 #: A stiffness per area, a law, pairs of gap and pressure, or a function of gaps ``(n,)`` that returns pressures ``(n,)``.
-OfGap: TypeAlias = float | PressureLaw | Sequence[tuple[float, float]] | Callable[[Array], npt.ArrayLike]
+OfGap: TypeAlias = float | fem.Constant | PressureLaw | Sequence[tuple[float, float]] | Callable[[Array], npt.ArrayLike]
 
 
 class SoftContact(given.Sealed):
@@ -65,9 +67,9 @@ class SoftContact(given.Sealed):
         uem.SoftContact([(-3e-6, 4e6), (-1e-6, 1e6), (0.0, 0.0)])
 
     Args:
-        p: stiffness per area; or a law, ``Exponential`` or ``PowerLaw``; or a table of at least two gaps, in ascending order, with
-            their pressures; or a function of gaps ``(n,)``, negative where surfaces overlap, that returns pressures ``(n,)``. Pressures
-            are 0 or positive and do not increase with the gap.
+        p: stiffness per area, a number or a Constant; or a law, ``Exponential`` or ``PowerLaw``; or a table of at least two gaps, in
+            ascending order, with their pressures; or a function of gaps ``(n,)``, negative where surfaces overlap, that returns
+            pressures ``(n,)``. Pressures are 0 or positive and do not increase with the gap.
         slope: derivative of a function p by the gap, ``(n,)``; None computes it from differences.
         damping: pressure per speed at which surfaces in contact approach each other, in addition to p(g); the sum is never negative.
             In time steps only.
@@ -79,18 +81,22 @@ class SoftContact(given.Sealed):
 
     def __init__(self, p: OfGap, slope: Callable[[Array], npt.ArrayLike] | None = None, *, damping: float = 0.0):
         self.damping = given.number("damping", damping, given.NOT_NEGATIVE)
+        # a Constant of UFL is callable
+        function = p if callable(p) and not isinstance(p, fem.Constant) else None
         if slope is not None:
-            given.kind("slope", slope, callable(slope) and callable(p), "a function of gaps, for a function p", "leave it out")
+            given.kind(
+                "slope", slope, callable(slope) and function is not None, "a function of gaps, for a function p", "leave it out"
+            )
         if hasattr(p, "pressure"):
             self.law: PressureLaw = given.kind("p", p, True, "a law")
-        elif callable(p):
-            self.law = _OfFunction(p, slope)
+        elif function is not None:
+            self.law = _OfFunction(function, slope)
         elif isinstance(p, Sequence | np.ndarray) and not isinstance(p, str):
             from uem_dolfinx.contact.laws.pressure_table import PressureTable
 
             self.law = PressureTable.of(p)
         else:
-            self.law = Linear(given.number("p", p, given.POSITIVE))
+            self.law = Linear(checked("p", p, given.POSITIVE))
 
     def __repr__(self) -> str:
         """Its law, with its numbers."""
@@ -123,3 +129,20 @@ class SoftContact(given.Sealed):
             behind, ahead = (checked("p", side, 1.0) for side in sides)
             slope = (ahead - behind) / (2.0 * step)
         return p, checked("slope", slope, -1.0)
+
+    @property
+    def constants(self) -> list[fem.Constant]:
+        """Constants among the law's attributes."""
+        return [one for one in getattr(self.law, "__dict__", {}).values() if isinstance(one, fem.Constant)]
+
+    def by_constant(self, comm: MPI.Comm, name: str, gap: Array, m: fem.Constant) -> Array:
+        """Derivatives of pressures at gaps ``(n,)`` by one of the Constants, from differences (collective); see ``pressures``."""
+        before, sides = float(m.value), []
+        step = OF_GAP * abs(before) or OF_GAP
+        try:
+            for side in (before + step, before - step):
+                m.value = side
+                sides.append(self.pressures(comm, name, gap, 0.0)[0])
+        finally:
+            m.value = before
+        return np.asarray((sides[0] - sides[1]) / (2.0 * step))

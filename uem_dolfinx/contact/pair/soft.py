@@ -27,6 +27,7 @@ from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
@@ -243,6 +244,12 @@ class SoftInterface(Interface):
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """The contact forces by the rows, as loads of both bodies."""
         return self.kinematics.gap_rows.forces(self._multipliers) if self._acts else None
+
+    def pushed_by(self, m: fem.Constant) -> Array:
+        """Derivative of the residual by a Constant of the law at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        by = self._law.by_constant(self.config.comm, self.name, self._at, m)
+        nodes, forces = self.kinematics.gap_rows.forces(self._area * by / self._force)
+        return -self.config.add_at_owners(nodes, forces)
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """Stiffness of the gaps, and their forces by what is left between the gaps and those of the law; see ``Interface``."""

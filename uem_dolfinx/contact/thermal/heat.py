@@ -21,7 +21,8 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.laws.conductance import Conductance, value
+from uem_dolfinx.contact.laws.conductance import Conductance
+from uem_dolfinx.contact.laws.constants import value
 from uem_dolfinx.contact.seam.dyads import Terms, dyads
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics
 from uem_dolfinx.contact.seam.state import PairState

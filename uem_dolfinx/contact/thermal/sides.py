@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.contact.laws.conductance import value
+from uem_dolfinx.contact.laws.constants import value
 from uem_dolfinx.contact.seam.placement import Kinematics
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
