@@ -58,7 +58,7 @@ class NodeToSurface(OnTarget):
         how: dict[str, Any] = {"sliding": other.sliding, "thickness": other.thickness}
         return cls(other.config, other.nodes, other.target, free=other.setting.free, **how)
 
-    @property
+    @cached_property
     def concave_edges(self) -> ConcaveEdges | None:
         """Tracking of contactors from facet to facet; None for targets with continuous normals."""
         if self.sliding != "finite" or not self.target.faceted:
