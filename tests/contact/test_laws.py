@@ -134,7 +134,7 @@ def test_a_proportional_limit_has_no_rest():
 
     plain, _ = dragged("quadrilateral", 0.3)
     contact, _ = dragged("quadrilateral", Rounded(0.3))
-    assert not contact.pair.has_known_forces
+    assert not contact.pair.friction.has_known_forces(contact.pair.trial)
     np.testing.assert_allclose(np.array(contact.resultant().force), np.array(plain.resultant().force), rtol=1e-9)
 
 

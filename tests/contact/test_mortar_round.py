@@ -102,7 +102,7 @@ def test_rows_do_not_depend_on_who_is_active():
         q = pair.config.vector(np.cos(3 * pair.config.X[: pair.config.n_owned]))
         du = rows.expand(q)
         du.axpy(1.0, rows.c)
-        gap = pair.predicted(du.array_r.reshape(-1, 3))
+        gap = pair.kinematics.gap_rows.gaps(du.array_r.reshape(-1, 3))
         assert highest(COMM, np.abs(gap[pair.trial.active])) < 1e-13
         assert COMM.allreduce(int(pair.trial.active.sum())) > 0
     pair.trial = start

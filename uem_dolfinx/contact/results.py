@@ -139,7 +139,7 @@ class ContactResults(HeatResults):
 
     def max_gap(self) -> float:
         """Largest gap of an active contactor, a length (collective)."""
-        return self.pair.largest_gap()
+        return float(reduced(self.config.comm, self.pair.largest_gap_here(), op=MPI.MAX))
 
     @cached_property
     def surface(self) -> Areas:

@@ -171,7 +171,7 @@ class CohesiveInterface(SofteningInterface):
         return bonds if own is None else together(own, bonds)
 
     def displaced(self) -> float:
-        """See ``Told``."""
+        """See ``Readings``."""
         size = np.linalg.norm(self.points, axis=1, ord=np.inf) if len(self.nodes) else np.zeros(0)
         stiff = np.abs(self._tangent).sum(axis=2).max(axis=1, initial=0.0)
         return float(np.sqrt(2.0 * reduced(self.config.comm, float(((stiff * size) ** 2).sum()))))
@@ -194,7 +194,7 @@ class CohesiveInterface(SofteningInterface):
         super().set_friction(law, self._rubbing(value))
 
     def know_friction(self, law: FrictionLaw, value: Array) -> None:
-        """See ``Told``; ``value (n,)`` is that of surfaces without cohesion (collective)."""
+        """See ``Readings``; ``value (n,)`` is that of surfaces without cohesion (collective)."""
         self._mu = value
         super().know_friction(law, self._rubbing(value))
 

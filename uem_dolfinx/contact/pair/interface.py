@@ -15,7 +15,7 @@ import numpy.typing as npt
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.law import FrictionLaw
-from uem_dolfinx.contact.pair.told import Told
+from uem_dolfinx.contact.pair.readings import Readings
 from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics, Traction
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 POSITION_ROUNDING = 4.0 * np.finfo(float).eps
 
 
-class Interface(Told):
+class Interface(Readings):
     """Contactors against one target.
 
     Args:
@@ -190,10 +190,6 @@ class Interface(Told):
         self._set_active(state)
         return gone or moved
 
-    def predicted(self, du: Array) -> Array:
-        """Deciding gaps, to first order in an increment of the owned nodes ``(n_owned, gdim)``: ``(n,)`` (collective)."""
-        return self.kinematics.gap_rows.gaps(du)
-
     def violated(
         self,
         gap: Array,
@@ -345,16 +341,6 @@ class Interface(Told):
         """Set contact forces of the trial state, and the active set ``(n,)`` if a method other than elimination decides on it."""
         state = self.with_forces(found)
         self.trial = state if active is None else replace(state, active=active)
-
-    @property
-    def has_known_forces(self) -> bool:
-        """Whether friction of any contactor of this rank may be independent of the normal force."""
-        return self.friction is not None and self.friction.has_known_forces(self.trial)
-
-    def known_forces(self) -> tuple[Ints, Array]:
-        """Friction forces independent of the normal force: nodes ``(k,)``, forces ``(k, gdim)`` (collective)."""
-        assert self.friction is not None
-        return self.friction.known_forces(self.trial, self.kinematics)
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""

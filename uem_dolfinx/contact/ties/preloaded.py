@@ -137,7 +137,7 @@ class Preloaded(Tie):
 
     @property
     def chained(self) -> bool:
-        """See ``Told``; True, since all rows depend on the contactor of the leading row."""
+        """See ``Readings``; True, since all rows depend on the contactor of the leading row."""
         return True
 
     def _equations(self) -> UnitingEquations:
@@ -205,11 +205,11 @@ class Preloaded(Tie):
 
     @property
     def works(self) -> bool:
-        """See ``Told``; True while the opening is free."""
+        """See ``Tie``; True while the opening is free."""
         return not self.locked
 
     def applied_forces(self, force: float | None = None) -> tuple[Ints, Array] | None:
-        """See ``Told``; the pair of forces on the faces, by default the given one, while the opening is free (collective)."""
+        """See ``Readings``; the pair of forces on the faces, by default the given one, while the opening is free (collective)."""
         if self.locked:
             return None
         assert self.rows is not None

@@ -198,12 +198,12 @@ class Tie:
         return way
 
     def kept_gaps(self) -> Array:
-        """See ``Told``."""
+        """Constant heights of this rank's tied contactors over the target ``(k,)``."""
         spacers = None if self.rows is None else self.rows.spacers
         return np.zeros(0) if spacers is None else spacers.height
 
     def torn(self) -> Array:
-        """See ``Told``."""
+        """Violation of tie equations that were dropped as redundant ``(n,)``."""
         return np.linalg.norm(np.where(self._left_out, self.apart(), 0.0), axis=1)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
@@ -262,22 +262,22 @@ class Tie:
 
     @property
     def chained(self) -> bool:
-        """See ``Told``; here because of the tie."""
+        """See ``Readings``; here because of the tie."""
         return False
 
     @property
     def works(self) -> bool:
-        """See ``Told``; here because of the tie."""
+        """Whether its forces do external work."""
         return False
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
-        """See ``Told``."""
+        """See ``Readings``."""
         return None
 
     # -- results ---------------------------------------------------------------------------------------------------------
 
     def pressing(self, state: PairState, n: Array, lam: Array, tau: Array) -> tuple[Array, Array]:
-        """See ``Told``; from contact forces and normals ``(n, gdim)``, with tied contactors, which may be in tension (collective)."""
+        """See ``Readings``; from contact forces and normals ``(n, gdim)``, with tied contactors, which may be in tension (collective)."""
         if self.rows is None or state.bond is None:
             return lam, tau
         force = state.bond * self.rows.share
@@ -286,7 +286,7 @@ class Tie:
         return np.where(self.tied, along, lam), np.where(self.tied[:, None], force - along[:, None] * n, tau)
 
     def areas(self, areas: Array, reference: Array, found: Array) -> Array:
-        """See ``Told``; from the areas of contact ``found (n,)`` (collective)."""
+        """See ``Readings``; from the areas of contact ``found (n,)`` (collective)."""
         if self.rows is None:
             return found
         if self.rows.area is None:

@@ -102,7 +102,7 @@ def check_prescribed(pair: Interface) -> None:
                 "move there; release the condition along the normal, or drop one of the contacts"
             )
         )
-    misfit = pair.torn()
+    misfit = np.zeros(len(pair.nodes)) if pair.tie is None else pair.tie.torn()
     if misfit.max(initial=0.0) > LEFT_OUT * pair.config.size:
         i = int(misfit.argmax())
         error = ConflictError(

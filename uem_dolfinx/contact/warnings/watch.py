@@ -60,7 +60,9 @@ class WatchedContact(OfBothSides):
 
         Of tied contactors it is the largest gap that is kept.
         """
-        own = self.pair.kept_gaps() if self._offsets is None else self._offsets.adjusted
+        tie = self.pair.tie
+        kept = np.zeros(0) if tie is None else tie.kept_gaps()
+        own = kept if self._offsets is None else self._offsets.adjusted
         return float(reduced(self.config.comm, float(np.abs(own).max(initial=0.0)), op=MPI.MAX))
 
     @property

@@ -206,10 +206,11 @@ def curvature_of(
 
 def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:
     """Frictional forces that are independent of normal forces, of pairs with such forces on any rank (collective)."""
-    if not any(pair.frictional for pair in pairs):
+    rubbing = [(pair, pair.friction) for pair in pairs if pair.friction is not None]
+    if not rubbing:
         return []
-    told = reduced(pairs[0].config.comm, np.array([pair.has_known_forces for pair in pairs]), op=MPI.LOR)
-    return [pair.known_forces() for pair in compress(pairs, told)]
+    some = reduced(pairs[0].config.comm, np.array([own.has_known_forces(pair.trial) for pair, own in rubbing]), op=MPI.LOR)
+    return [own.known_forces(pair.trial, pair.kinematics) for pair, own in compress(rubbing, some)]
 
 
 def slip_terms(

@@ -49,7 +49,7 @@ def touch_ahead(
     look_within(way)
     near = OPEN * way
     pairs = in_question(pairs)
-    gaps = [pair.predicted(du) for pair in pairs]
+    gaps = [pair.kinematics.gap_rows.gaps(du) for pair in pairs]
     violated = []
     for pair, gap in zip(pairs, gaps):
         none = np.zeros(len(pair.nodes))

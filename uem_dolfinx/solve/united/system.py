@@ -290,7 +290,7 @@ class BodySystem:
             near = max(PREDICTED, left) * way
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
-            gaps = [pair.predicted(increment) if pair.asked else pair.gap for pair in self.pairs]
+            gaps = [pair.kinematics.gap_rows.gaps(increment) if pair.asked else pair.gap for pair in self.pairs]
             violated = [Violations.none(len(pair.nodes)) for pair in self.pairs]
             for k, pair in ((k, pair) for k, pair in enumerate(self.pairs) if pair.asked):
                 along = pair.stiffness_across(self.bodies.stiffness)

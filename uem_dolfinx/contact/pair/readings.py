@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from mpi4py import MPI
-
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -16,7 +14,6 @@ from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics, Tract
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Projection, Target
-from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
@@ -24,7 +21,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.ties.tie import Tie
 
 
-class Told:
+class Readings:
     """Read access for results, checks and checkpoints; attributes as in ``Interface``."""
 
     name: str
@@ -157,10 +154,6 @@ class Told:
             here = max(here, float(self.friction.distances(self.trial, self.redundant).max(initial=0.0)))
         return here if self.tie is None else max(here, self.tie.largest_gap_here())
 
-    def largest_gap(self) -> float:
-        """``largest_gap_here`` over all ranks, a length (collective)."""
-        return float(reduced(self.config.comm, self.largest_gap_here(), op=MPI.MAX))
-
     @property
     def tied(self) -> Bools:
         """Contactors tied permanently to the target in all components ``(n,)``."""
@@ -186,23 +179,10 @@ class Told:
         found = self.kinematics.pressure_map(current).areas(areas)
         return found if self.tie is None else self.tie.areas(areas, reference, found)
 
-    def kept_gaps(self) -> Array:
-        """Constant heights of this rank's tied contactors over the target ``(k,)``."""
-        return np.zeros(0) if self.tie is None else self.tie.kept_gaps()
-
-    def torn(self) -> Array:
-        """Violation of tie equations that were dropped as redundant ``(n,)``."""
-        return np.zeros(len(self.nodes)) if self.tie is None else self.tie.torn()
-
     @property
     def chained(self) -> bool:
         """Whether contactors may follow each other."""
         return self.discretisation.traits.chained or (self.tie is not None and self.tie.chained)
-
-    @property
-    def works(self) -> bool:
-        """Whether its forces do external work, for example on a moving rigid target."""
-        return self.discretisation.target.motion is not None or (self.tie is not None and self.tie.works)
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without loads (collective)."""
