@@ -111,10 +111,9 @@ def _part_of(contact: Contact, config: Configuration, free: Bools, clock: dict[s
     # where an edge lies on a contactor, or on an edge of the contactor, one follows the other
     stay = facets.on_sides(facets.open_sides)[own.nodes]
     within = np.where(stay, 0.0, AT_CORNER * sizes_at(facets, own.nodes))
-    own.leaves_out = AtEdges(target, sides, within)
+    order = -1 - next(_orders)
+    own.leave(AtEdges(target, sides, within), order)
     at, ends = target.facets, [nodes[:2] for _, nodes, _, _ in target.shape.edges] if config.gdim == 3 else []
     edges = np.concatenate([np.zeros((0, 2), np.int32), *(at.dofs[sides[:, s]][:, two] for s, two in enumerate(ends))])
-    theirs.leaves_out = AlongEdges(config, theirs.target, facets.open_sides, END_HOLDS, nodes, edges)
-    theirs.ends_hold = False
-    own.traits = theirs.traits = own.traits._replace(order=-1 - next(_orders))
+    theirs.leave(AlongEdges(config, theirs.target, facets.open_sides, END_HOLDS, nodes, edges), order, ends_hold=False)
     return part

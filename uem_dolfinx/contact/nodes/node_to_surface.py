@@ -45,8 +45,8 @@ class NodeToSurface(OnTarget):
     ends_hold: bool | Bools = True
     #: Contactors that something else holds, so that they must not touch the target ``(n,)``, or None.
     left_out: Bools | None = None
-    #: Which contactors, by their projection, are left to other equations ``(n,)`` (collective); None: none are.
-    leaves_out: Callable[[FacetProjection], Bools] | None = None
+    #: Which contactors are left to other equations, see ``leave``; None: none are.
+    _leaves: Callable[[FacetProjection], Bools] | None = None
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -73,6 +73,10 @@ class NodeToSurface(OnTarget):
         #: Followed nodes of the last call ``(n, nt)``, and their free components ``(n, nt, gdim)``.
         self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
 
+    def leave(self, which: Callable[[FacetProjection], Bools], order: int, *, ends_hold: bool = True) -> None:
+        """Leave contactors, ``which (n,)`` by their projection (collective), to another contact; both share an order of bodies."""
+        self._leaves, self.ends_hold, self.traits = which, ends_hold, self.traits._replace(order=order)
+
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
         self.asked = self._asks(state)
@@ -89,7 +93,7 @@ class NodeToSurface(OnTarget):
             else:
                 nearest = projection = self.on_target(points, self.anchor)
         moves = self._target_moves(projection) if self.setting.prescribed else None
-        out = None if self.leaves_out is None else self.leaves_out(cast("FacetProjection", nearest))
+        out = None if self._leaves is None else self._leaves(cast("FacetProjection", nearest))
         return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves, out=out), state)
 
     def _asks(self, state: PairState) -> bool:
