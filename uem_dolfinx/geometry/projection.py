@@ -120,8 +120,8 @@ class Target(Protocol):
     def follow(self, points: Array, old: Any) -> Projection:
         """Gaps with closest points, normals and weights of an earlier projection of this target (small sliding, collective)."""
 
-    def continued(self, projection: Any, which: Ints) -> Projection:
-        """The projection with some closest points continued past the target's open end, up to below their points."""
+    def continued(self, projection: Any, which: Ints, places: Array) -> Projection:
+        """The projection with some facets continued past their sides, up to below ``places (k, gdim)``."""
 
     def chords(self, projection: Any) -> Array:
         """Weights of the straight pieces between the nodes of curved facets at the closest points ``(n, nn)`` [UEM, 4.5]."""
@@ -204,6 +204,11 @@ class FacetProjection:
         beside &= (np.abs(offset) > ROUNDS_AN_EDGE * self.facet_size) & (side * offset > 0.0) & (length < 2.0 * np.abs(offset))
         n = side[:, None] * away / np.where(length > 0.0, length, 1.0)[:, None]
         return replace(self, gap=np.where(beside, side * length, self.gap), normal=np.where(beside[:, None], n, self.normal))
+
+    def behind_edges(self, points: Array) -> Ints:
+        """Which ``points (n, gdim)`` are inside the target, and below no point of their facet, but behind one of its concave edges."""
+        beside = np.linalg.norm(points - self.foot - self.height[:, None] * self.normal, axis=1)
+        return np.flatnonzero((self.height < 0.0) & (beside > ALONG_NORMAL * self.facet_size) & ~self.beyond.any(axis=1))
 
     def take(self, which: Ints) -> FacetProjection:
         """Some of its rows ``(k,)``."""

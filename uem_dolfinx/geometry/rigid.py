@@ -248,7 +248,7 @@ class RigidSurface(given.Sealed):
             old, gap=gap, offset=None, normal=normal, points=points.copy(), shape_operator=shape_operator, motion=self.motion
         )
 
-    def continued(self, projection: RigidProjection, which: Ints) -> RigidProjection:
+    def continued(self, projection: RigidProjection, which: Ints, places: Array) -> RigidProjection:
         """Unchanged, since the surface has no end."""
         return projection
 

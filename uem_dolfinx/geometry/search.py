@@ -138,10 +138,10 @@ class MeshTarget:
         """Key of each of this rank's facets, independent of the partition ``(m,)``."""
         return self.facets.keys
 
-    def continued(self, projection: FacetProjection, which: Ints) -> FacetProjection:
-        """The projection with some facets continued past the target's open end, as far as their points lie beyond it."""
+    def continued(self, projection: FacetProjection, which: Ints, places: Array) -> FacetProjection:
+        """The projection with some facets continued past their sides, up to below ``places (k, gdim)``."""
         p, x = projection, projection.x[which]
-        xi, tab = beneath(self.shape, x, p.xi[which], p.foot[which] + p.beyond[which])
+        xi, tab = beneath(self.shape, x, p.xi[which], places)
         foot = np.einsum("ka,kag->kg", tab.N, x)
         return p.with_rows(which, {"xi": xi, "weights": tab.N, "dN": tab.dN, "ddN": tab.ddN, "foot": foot})
 

@@ -112,7 +112,7 @@ class NodeToSurface(OnTarget):
     def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
         """Continue closest points of contactors held by an end to below these, so that force and reaction are collinear."""
         i = np.flatnonzero(state.active & state.at_end & (nearest.beyond != 0).any(axis=1))
-        return self.target.continued(nearest, i) if len(i) else nearest
+        return self.target.continued(nearest, i, nearest.foot[i] + nearest.beyond[i]) if len(i) else nearest
 
     def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:
         """Set the closest points of sticking contactors to their anchors, so that edges between facets have no effect (collective)."""

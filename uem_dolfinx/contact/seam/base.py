@@ -86,9 +86,16 @@ class OnTarget:
             found = self.target.project(points) if anchor is None else self.target.follow(points, anchor)
             if anchor is None and self.offset is not None and isinstance(found, FacetProjection):
                 found = self.across(found, points)
+            if anchor is None:
+                found = self._turning(found, points)
             raised = self.raised(found)
             self._projected = last = points, x, anchor, raised
         return last[3]
+
+    def _turning(self, found: Any, points: Array) -> Any:
+        """The projection with facets continued behind concave edges, so that gaps do not change to first order as all bodies turn."""
+        behind = found.behind_edges(points) if isinstance(found, FacetProjection) and self.target.faceted else []
+        return self.target.continued(found, behind, points[behind]) if len(behind) else found
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
         """The projection of contactors with offset, with normals that point away from convex edges."""
@@ -97,7 +104,7 @@ class OnTarget:
 
     def take_feet(self, points: Array) -> Projection:
         """Projection onto the nearest points of the target, which are kept from now on (collective)."""
-        self.anchor = found = self.target.project(points)
+        self.anchor = found = self._turning(self.target.project(points), points)
         raised = self.raised(found)
         self._projected = points, self.config.x[self.target.dofs], found, raised
         return raised
