@@ -37,7 +37,7 @@ def dirichlet(
         component: 0 is x; None prescribes all components.
         value: a number, or for all components a vector ``(size,)``; or a Constant of one of these shapes, or a Function of ``V``
             (for one component of a scalar space of the same degree), both of which may be changed between steps. A vector part of a
-            mixed space needs one condition per component. Or a function of the places x ``(3, n)``, as in DOLFINx's ``interpolate``,
+            mixed space needs one condition per component. Or a function of positions x ``(3, n)``, as in DOLFINx's ``interpolate``,
             which returns ``(n,)``, or for all components ``(size, n)``; with a second argument it is a function of the load factor
             or time, which needs no ``load`` and is not ramped. Or a UFL expression, such as the component ``w[1]`` of a Function, which
             is evaluated in every step.

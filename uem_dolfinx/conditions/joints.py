@@ -248,7 +248,7 @@ class Hinge(Joint):
     Args:
         a, b, point: as in ``Ball``.
         axis: reference direction ``(3,)`` in space; none in the plane.
-        stiffness: moment about the axis per angle, of a torsional spring that is free at angle 0.
+        stiffness: moment about the axis per angle, of a torsional spring without moment at angle 0.
 
     Raises:
         InputError, InputTypeError: as in ``Ball``, and for an axis without direction.

@@ -71,7 +71,7 @@ class Contact(WatchedContact, given.Sealed):
             ``(meshtags, value)``, or facet indices.
         target: facets of the other body, specified in the same way, or a rigid surface.
         coupling: ``"node_to_surface"``, the paper's, or ``"mortar"``, from integrals over both surfaces: exact on any pair of meshes;
-            a contactor of points keeps nodal equations. Or a class of ``contact.kinematics.Discretisation``, made as ``NodeToSurface`` is.
+            a contactor of points keeps nodal equations. Or a class of ``contact.seam.placement.Discretisation``, as ``NodeToSurface`` is.
         sliding: ``"finite"`` projects in every iteration, ``"small"`` once per step, ``"fixed"`` once for all.
         normals: ``"facet"``, the paper's, or ``"averaged"`` at the target's nodes and interpolated.
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
@@ -104,7 +104,7 @@ class Contact(WatchedContact, given.Sealed):
         normal: None is hard contact; a ``SoftContact`` makes the pressure a function of the gap, without friction, wear, heat and tie.
         cohesion: a ``Cohesive`` bonds the contactors that ``adjust`` reaches, as a tie, until they separate. Its results are
             :attr:`damage`, and :attr:`pressure` and :attr:`traction` with the bonds. Friction acts on the damaged part. An
-            ``Adhesion`` attracts whatever faces each other.
+            ``Adhesion`` attracts all facing surfaces.
         leak: a ``Leak`` lets a fluid enter between the surfaces from one side, which presses on both.
         corners: True makes nodes at pointed convex edges of a meshed target contactors of the contactor's facets, too, with
             ``"node_to_surface"`` and hard contact without wear, ``adjust`` and heat. False: they may enter between contactors.

@@ -78,7 +78,7 @@ class UnitedProblem(given.Sealed):
             only. In time steps the factor is replaced by the time.
         dynamics: mass, velocity and time integration; None is statics.
         materials: all laws with history in F, such as ``VonMises``.
-        newton: settings of Newton's method, ``uem.Newton(...)``; or one of its words, with the following six as its arguments.
+        newton: settings of Newton's method, ``uem.Newton(...)``; or the name of its method, with the following six as its arguments.
         consistent_tangent, line_search, check_inversion, rtol, max_iterations, verbose: see ``Newton``.
         J: tangent in UFL, bilinear in a test and a trial function of the space of ``u``; by default the derivative of F by u. Laws with
             history, damping and inertia add their own. It need not be exact, but gradients need the derivative.

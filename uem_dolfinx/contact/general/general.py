@@ -65,8 +65,8 @@ class GeneralContact(OfProblem, given.Sealed):
         name: for messages and files.
         normal: see ``Contact``; its pressure must be 0 from a gap of half a facet on. Only nearest facets press.
         heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
-        edges: whether sharp edges of different bodies that cross are held apart in 3D, by one equation at each crossing; None where
-            that goes: with ``"node_to_surface"``, without ``normal``, ``heat`` and laws of friction by area.
+        edges: whether sharp edges of different bodies that cross are held apart in 3D, by one equation at each crossing; None:
+            if supported, with ``"node_to_surface"``, without ``normal``, ``heat`` and laws of friction by area.
         others: further arguments of ``Contact``, such as ``cohesion`` and ``leak``, at their defaults only.
 
     Raises:

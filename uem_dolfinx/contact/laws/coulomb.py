@@ -18,7 +18,7 @@ class Coulomb:
     """A contactor slips if the tangential force reaches ``mu lam``, or ``limit A`` or ``force`` if these are smaller.
 
     Args:
-        field: the coefficient mu, a number, or a function of place that is given reference points ``(3, n)`` and returns ``(n,)``.
+        field: the coefficient mu, a number, or a function of reference positions ``(3, n)`` that returns ``(n,)``.
         limit: the largest friction stress, a force per reference area, such as the shear yield stress of the softer body; None for
             no limit.
         force: the largest friction force on each contactor, for contactors given as points; None for no limit.

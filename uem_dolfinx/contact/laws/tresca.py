@@ -18,8 +18,8 @@ class Tresca:
     The matrix of the constrained system is symmetric, since test rows are the rows of P.
 
     Args:
-        field: the stress tau, a force per reference area: a number, or a function of place that is given reference points ``(3, n)`` and
-            returns ``(n,)``.
+        field: the stress tau, a force per reference area: a number, or a function of reference positions ``(3, n)`` that returns
+            ``(n,)``.
     """
 
     field: float | Callable[[Array], npt.ArrayLike]

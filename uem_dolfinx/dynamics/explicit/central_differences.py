@@ -24,8 +24,8 @@ class CentralDifferences:
 
     A step of bodies with linear elasticity multiplies by K instead of assembling the residual, unless their loads change, and no matrix
     is factorised unless the contact changes. With ``Dynamics(..., contactors="massy")`` all nodes move by their masses, and contact
-    corrects them by the united system P'MP. Impacts of the surface's own mass are then plastic, and general contact and thin walls go as
-    well. Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011) 223-249, https://doi.org/10.1137/100791440.
+    corrects them by the united system P'MP. Impacts of the surface's own mass are then plastic, and general contact and thin walls are
+    supported. Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011) 223-249, https://doi.org/10.1137/100791440.
 
     Damping forms are those of the velocity in the middle of the step.
 

@@ -44,7 +44,7 @@ def load_steps(
         arc_length: prescribe the load of the first step only, and its length in displacement for all other steps. The load factor is an
             unknown, which increases up to limit points and decreases beyond them, until it is 1. Dirichlet values are not ramped.
             A ``Dissipation`` also controls the energy that damage dissipates in a step, to follow paths that snap back.
-        tolerance: shorten steps until what they change differs by less than this part from two steps of half the length, which count;
+        tolerance: shorten steps until their change of the state differs by less than this part from two half steps, whose result is kept,
             and lengthen them where they allow it. So histories of friction and plasticity have about this error. None: no such test.
         estimate: called with the problem after every step, as ``ErrorLimit(0.05)``, which warns of errors by the mesh; or None.
         checkpoint: counts the steps, after the body of the loop, and stores the state; an existing file is resumed, here or earlier

@@ -49,7 +49,7 @@ def time_steps(
     event_tolerance: float | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Iterator[TimeStep]:
-    """Step through time, with steps that end at multiples of ``dt`` after the start, behind a progress bar on a terminal.
+    """Step through time, with steps that end at multiples of ``dt`` after the start, with a progress bar on a terminal.
 
     A step is halved when it does not converge, when a contactor would pass through a target, or when contacts would add energy
     to the bodies. After easy steps it is increased again.
