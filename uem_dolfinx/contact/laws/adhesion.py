@@ -11,9 +11,8 @@ from uem_dolfinx.arrays import Array
 class Adhesion(given.Sealed):
     """Attraction of surfaces by their gap, ``strength (1 - g / range)`` up to the ``range = 2 energy / strength``.
 
-    Where surfaces touch, contact is hard, and they stay together while the tension is below the strength. Surfaces that touch again
-    adhere again. A large strength is the limit of Johnson, Kendall and Roberts (JKR), in which a sphere of radius R is pulled off by
-    ``1.5 pi energy R``.
+    Where surfaces touch, contact is hard; they separate at the strength, and adhere again when they touch. A large strength is the
+    limit of Johnson, Kendall and Roberts (JKR), in which a sphere of radius R is pulled off by ``1.5 pi energy R``.
 
     Args:
         energy: of adhesion, an energy per area.
