@@ -145,8 +145,9 @@ if _TYPE_CHECKING:
     from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.gradients.gradient import gradient, tangent, taylor_test
-    from uem_dolfinx.gradients.history import History, recording
+    from uem_dolfinx.gradients.history import History
     from uem_dolfinx.gradients.parameters import ContactParameter
+    from uem_dolfinx.gradients.recording import recording
     from uem_dolfinx.materials.finite_plasticity import FinitePlasticity
     from uem_dolfinx.materials.hardening import Voce
     from uem_dolfinx.materials.von_mises import VonMises
@@ -201,7 +202,7 @@ _LATER = {
     "GoalError": "accuracy.goal", "goal_error": "accuracy.goal",
     "ContactParameter": "gradients.parameters",
     "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
-    "History": "gradients.history", "recording": "gradients.history",
+    "History": "gradients.history", "recording": "gradients.recording",
     "Newton": "solve.settings",
     "Step": "solve.steps.step", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Derivatives of a step with friction by its initial anchors, and of anchors by earlier positions of contactors; in reverse mode only.
+"""Derivatives of a step with friction by its initial anchors, and of anchors by earlier positions of contactors, in both modes.
 
 A sticking contactor coincides with its anchor A, a point of the target, in all components,
 
@@ -12,6 +12,7 @@ that does not stick is its closest point, with the derivatives of the projection
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.projection import FacetProjection, foot_slopes
 from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.parallel import reduced
+
+#: What has no derivative in 3D, in messages.
+BEYOND = "edge of the target is nearest to"
 
 
 class AnchorSlopes:
@@ -133,31 +137,104 @@ class AnchorSlopes:
     def back(self, by_anchors: Array, first: bool) -> tuple[Array, Array]:
         """Derivatives by positions and by initial anchors, from derivatives by final anchors of the step ``(n, k)`` (collective).
 
-        ``first``: for the state before the first step, in which all anchors are closest points.
+        ``by_anchors`` is empty if there are none yet. ``first``: for the state before the first step, in which all anchors are closest
+        points.
 
         Returns:
             By the positions of the owned nodes ``(n_owned, gdim)``, and by the unchanged anchors ``(n, k)``.
         """
-        f, pair = self._pair.trial.friction, self._pair
-        assert f is not None
-        loose = ~f.stick | ~self._sliding.active(pair.trial) | first
+        pair, loose = self._pair, self._loose(first)
+        by_anchors = by_anchors if by_anchors.size else np.zeros((len(pair.nodes), self.size))
         i = np.flatnonzero(loose & by_anchors.any(axis=1))
         p, own = pair.kinematics.nearest, np.zeros((self._config.n_owned, self._config.gdim))
         if isinstance(p, FacetProjection):
-            t, D = foot_slopes(p, i)
-            off = np.einsum("kfg,kg->kf", t, pair.points[i] - p.foot[i])
-            free = np.abs(off) <= ON_SIDE * np.einsum("kfg,kfg->kf", t, t)
-            # past an end or over a convex edge, the closest point is fixed or moves along the edge
+            free, D = self._feet(p, i)
             if self._config.gdim == 3:
                 beyond = np.zeros(len(loose), dtype=bool)
                 beyond[i] = ~free.all(axis=1)
-                self._refuse(beyond, "edge of the target is nearest to")
+                self._refuse(beyond, BEYOND)
             forces = np.einsum("kf,kfi->ki", np.where(free, by_anchors[i], 0.0), D).reshape(-1, self._config.gdim)
             nodes = np.column_stack([self._config.to_global(pair.nodes[i]), p.nodes[i]])
             own = self._config.add_at_owners(nodes.ravel(), forces)
         else:
-            along = np.einsum("nkg,nk->ng", self._anchor[i], by_anchors[i])
-            n = p.normal[i]
-            along = along - np.einsum("kg,kg->k", n, along)[:, None] * n
-            own[pair.nodes[i]] = along - p.height[i, None] * np.einsum("kgh,kg->kh", p.hessians(i), along)
+            own[pair.nodes[i]] = self._below(p, i, np.einsum("nkg,nk->ng", self._anchor[i], by_anchors[i]), True)
         return own, np.where(loose[:, None], 0.0, by_anchors)
+
+    def _loose(self, first: bool) -> Bools:
+        """Contactors whose anchors are closest points at the end of the step ``(n,)``."""
+        f = self._pair.trial.friction
+        assert f is not None
+        return np.asarray(~f.stick | ~self._sliding.active(self._pair.trial) | first)
+
+    def _feet(self, p: FacetProjection, i: Ints) -> tuple[Bools, Array]:
+        """Coordinates of closest points that move freely ``(k, f)``, and derivatives of all ``(k, f, (1 + nn) gdim)``.
+
+        Past an end or over a convex edge, the closest point is fixed or moves along the edge.
+        """
+        t, D = foot_slopes(p, i)
+        off = np.einsum("kfg,kg->kf", t, self._pair.points[i] - p.foot[i])
+        return np.abs(off) <= ON_SIDE * np.einsum("kfg,kfg->kf", t, t), D
+
+    def _below(self, p: Any, i: Ints, v: Array, back: bool) -> Array:
+        """Changes of closest points on a rigid surface by those of contactors ``v (k, gdim)``, or ``back`` (collective)."""
+
+        def across(v: Array) -> Array:
+            return v - np.einsum("kg,kg->k", p.normal[i], v)[:, None] * p.normal[i]
+
+        v = across(v) if back else v
+        v = v - p.height[i, None] * np.einsum("kgh,kg->kh", p.hessians(i), v)
+        return v if back else across(v)
+
+    def pushed(self, moved: Array, equations: ContactRows) -> tuple[Array, Array]:
+        """Changes of the gaps of the pair's ``equations (m,)`` and of the residual ``(n_owned, gdim)`` with initial anchors (collective).
+
+        The transpose of ``by_anchors``.
+
+        Args:
+            moved: changes of the anchors ``(n, k)``, NaN where they have no derivative.
+            equations: of the pair.
+        """
+        pair, kinematics, config = self._pair, self._pair.kinematics, self._config
+        needed = self.stuck | (self._slips & (config.gdim == 3))
+        self._refuse(needed & np.isnan(moved).any(axis=1), BEYOND)
+        moved = np.where(needed[:, None], moved, 0.0)
+        there, own = np.einsum("nkg,nk->ng", self._anchor, moved), np.zeros((config.n_owned, config.gdim))
+        stuck = np.where(self.stuck[:, None], there, 0.0)
+        gaps = -np.einsum("mg,mg->m", equations.P.direction, stuck[equations.contactor])
+        p = kinematics.projection
+        if isinstance(p, FacetProjection):
+            share = np.einsum(
+                "naf,nf->na", np.where(p.nodes[..., None] >= 0, p.dN, 0.0), np.where(self.stuck[:, None], moved, 0.0)
+            )
+            own = config.add_at_owners(
+                np.maximum(p.nodes, 0).ravel(), (share[..., None] * pair.trial.force[:, None]).reshape(-1, config.gdim)
+            )
+        if config.gdim == 3:
+            i, (_, _, stiffness) = np.flatnonzero(self._slips), self._sliding.turning(pair.trial, kinematics)
+            turned = np.zeros_like(there)
+            turned[i] = np.einsum("kgh,kh->kg", stiffness, there[i])
+            own = own - config.add_at_owners(*self._sliding.frame.ties.handed_on(turned))
+        return gaps, own
+
+    def follow(self, moved: Array, way: Array, first: bool) -> Array:
+        """Changes of the anchors ``(n, k)`` at the end of the step, NaN where they have no derivative: the transpose of ``back``.
+
+        Args:
+            moved: changes of the initial anchors ``(n, k)``.
+            way: changes of the positions of the owned nodes, of contactors relative to a rigid target ``(n_owned, gdim)``.
+            first: see ``back``.
+        """
+        pair, loose = self._pair, self._loose(first)
+        p, i, found = pair.kinematics.nearest, np.flatnonzero(loose), np.array(moved)
+        if isinstance(p, FacetProjection):
+            # none is nearest to contactors that are far away
+            found[loose], i = np.nan, np.flatnonzero(loose & (p.nodes >= 0).all(axis=1))
+            free, D = self._feet(p, i)
+            nodes = np.column_stack([self._config.to_global(pair.nodes[i]), p.nodes[i]])
+            there = self._config.ask_owners(nodes.ravel(), way).reshape(len(i), nodes.shape[1] * self._config.gdim)
+            found[i] = np.where(free, np.einsum("kfi,ki->kf", D, there), 0.0)
+            if self._config.gdim == 3:
+                found[i[~free.all(axis=1)]] = np.nan
+        else:
+            found[i] = np.einsum("nkg,ng->nk", self._anchor[i], self._below(p, i, way[pair.nodes[i]], False))
+        return found

@@ -12,7 +12,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.nodes.bernstein import Bernstein
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.gradients.parameters import keeps_distance, rubbed_along, thickened
+from uem_dolfinx.gradients.parameters import keeps_distance, rubbed, rubbed_along, thickened
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -74,9 +74,11 @@ def _slopes(at: Any, k: int, contact: Contact, m: fem.Function, by_gaps: Array, 
 
 
 def along_field(at: Any, m: fem.Function, change: Array) -> tuple[Array, Array]:
-    """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` along changes of an offset's local values (collective)."""
+    """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` along changes of a Function's local values (collective)."""
     gaps, pushed = np.zeros_like(at.multipliers), np.zeros((at.config.n_owned, at.config.gdim))
     for k, contact in enumerate(at.problem.contacts):
+        if as_law(contact.friction).field is m and contact.pair.frictional:
+            pushed = pushed + rubbed(contact.pair, change[_entries(at, m, contact)])
         if contact.offset is m:
             which = at.equations_of(k, "its offset")
             more = change[_entries(at, m, contact)[at.equations[k].contactor]]

@@ -19,9 +19,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.laws.coulomb import Coulomb
-from uem_dolfinx.contact.laws.law import as_law, follows_load, is_of_position
-from uem_dolfinx.dynamics.explicit.refused import is_explicit
+from uem_dolfinx.contact.laws.law import as_law, is_of_position
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -29,13 +27,11 @@ from uem_dolfinx.gradients.assemblies import Prescribed, constants_of
 from uem_dolfinx.gradients.gradient import (
     AnyControl,
     check_controls,
-    check_problem,
     refuse_idle_controls,
     refuse_kept_projections,
     refuse_results,
     refuse_without_state,
 )
-from uem_dolfinx.gradients.parameters import keeps_distance
 from uem_dolfinx.gradients.records import Record, Records
 from uem_dolfinx.gradients.sweep import Sweep
 from uem_dolfinx.materials.elastic import material_of
@@ -182,30 +178,81 @@ class History(given.Sealed):
         refuse_idle_controls(problem, "controls", some, given_forms)
         self._check_controls(some)
         self._refuse_moved_nodes()
-        now, displacement = Memory.of(problem), np.array(problem.u.x.array)
-        values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
-        offsets, told = [pair.discretisation.setting.offset for pair in problem.pairs], Prescribed.of(problem)
         sweep = Sweep(problem, some)
-        try:
+        with self._replayed():
             begun = False
             for k in reversed(range(len(self))):
                 begun = begun or functionals[k] is not None
                 if begun:
-                    record = self._records[k]
-                    none = {id(one): 0.0 for one, first in zip(self._led, self._led_from) if k < first}
-                    record = replace(record, shares=none | record.shares)
-                    self._place(record)
+                    record = self._placed(k)
                     sweep.pass_back(record, functionals[k])
             sweep.begin(record)
             if self._start is not None:
                 self._place(self._start)
                 sweep.accelerate(self._start)
+        return sweep.found
+
+    def tangent(self, direction: Sequence[tuple[AnyControl, Any]]) -> list[fem.Function]:
+        """Derivatives of the displacements of all steps along changes of parameters, by one linear solve a step (collective).
+
+        Exact as ``gradient``, whose controls may be changed; for statics.
+
+            by_mu = history.tangent([(uem.ContactParameter(contact, "friction"), 1.0)])[-1]
+
+        Args:
+            direction: pairs of a control and its change, as in :func:`uem_dolfinx.tangent`.
+
+        Returns:
+            The derivative of the displacement at the end of each recorded step.
+
+        Raises:
+            InputError, InputTypeError, LinearSolveError: see ``gradient``.
+        """
+        problem = self.problem
+        pairs = check_controls(problem, "direction", direction)
+        with agreed(problem.comm):
+            if not len(self):
+                raise InputError("the history has no step: expected steps to be taken while it is recorded")
+            if problem.dynamics is not None:
+                raise InputError("tangents of histories are of statics: in time take the gradient of a functional")
+        controls = [control for control, _ in pairs]
+        refuse_idle_controls(problem, "direction", controls)
+        self._check_controls(controls, "direction")
+        self._refuse_moved_nodes()
+        from uem_dolfinx.gradients.forward import Forward
+
+        forward = Forward(problem, pairs)
+        with self._replayed():
+            for k in range(len(self)):
+                record = self._placed(k)
+                if k == 0:
+                    forward.begin(record)
+                    self._place(record)
+                forward.advance(record)
+        return forward.found
+
+    @contextmanager
+    def _replayed(self) -> Iterator[None]:
+        """Let recorded steps take the place of the problem's present state for a while (collective)."""
+        problem = self.problem
+        now, displacement = Memory.of(problem), np.array(problem.u.x.array)
+        values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
+        offsets, told = [pair.discretisation.setting.offset for pair in problem.pairs], Prescribed.of(problem)
+        try:
+            yield
         finally:
             self._put(values, friction, offsets)
             told.put_back(problem)
             now.put_back(problem)
             problem.u.x.array[:] = displacement
-        return sweep.found
+
+    def _placed(self, k: int) -> Record:
+        """Set the problem to the end of step k, and return its record (collective)."""
+        record = self._records[k]
+        none = {id(one): 0.0 for one, first in zip(self._led, self._led_from) if k < first}
+        record = replace(record, shares=none | record.shares)
+        self._place(record)
+        return record
 
     def _refuse_moved_nodes(self) -> None:
         """Refuse steps that were taken with other positions of the nodes (collective)."""
@@ -218,7 +265,7 @@ class History(given.Sealed):
                         "expected nodes that stay where they are while steps are recorded, and until there is a gradient"
                     )
 
-    def _check_controls(self, controls: Sequence[AnyControl]) -> None:
+    def _check_controls(self, controls: Sequence[AnyControl], what: str = "controls") -> None:
         """Refuse controls by which recorded steps have no derivatives (collective)."""
         problem, dynamics = self.problem, self.problem.dynamics
         load = problem.load if isinstance(problem.load, Mapping) else {}
@@ -230,27 +277,25 @@ class History(given.Sealed):
             for k, m in enumerate(controls):
                 if isinstance(m, ufl.SpatialCoordinate) and varied:
                     raise InputError(
-                        f"controls[{k}] is the shape, with which the friction of contact '{varied[0]}', a function of place, changes: "
+                        f"{what}[{k}] is the shape, with which the friction of contact '{varied[0]}', a function of place, changes: "
                         "there is no derivative by it; expected a number or a Function"
                     )
                 if isinstance(m, fem.Constant) and (callable(load.get(m)) or any(m is one for one in self._by_function)):
                     raise InputError(
-                        f"controls[{k}] is set by a function of the load factor: expected a Constant that is not, as one by which it is "
+                        f"{what}[{k}] is set by a function of the load factor: expected a Constant that is not, as one by which it is "
                         "multiplied in the residual"
                     )
                 if isinstance(m, ufl.SpatialCoordinate) and dynamics is not None:
-                    raise InputError(
-                        f"controls[{k}] is the shape, on which masses depend: there are no derivatives by it in time"
-                    )
+                    raise InputError(f"{what}[{k}] is the shape, on which masses depend: there are no derivatives by it in time")
                 if isinstance(m, ufl.SpatialCoordinate) and problem.materials:
-                    raise InputError(f"controls[{k}] is the shape, by which there are no derivatives through laws with history")
+                    raise InputError(f"{what}[{k}] is the shape, by which there are no derivatives through laws with history")
                 if isinstance(m, fem.Function) and material_of(m) is not None:
                     raise InputError(
-                        f"controls[{k}] is '{m.name}', a field of a law with history: expected what the problem is made of"
+                        f"{what}[{k}] is '{m.name}', a field of a law with history: expected what the problem is made of"
                     )
                 scales = m is density and isinstance(m, fem.Constant)
                 if not scales and any(m is one for one in made_of):
-                    raise InputError(f"controls[{k}] is a part of the density: expected a Constant that is the density itself")
+                    raise InputError(f"{what}[{k}] is a part of the density: expected a Constant that is the density itself")
 
     def _functionals(self, J: Any) -> list[ufl.Form | None]:
         """A functional for each step, or None (collective)."""
@@ -329,94 +374,3 @@ def _places(problem: UnitedProblem) -> bytes:
 
 def _friction_of(pair: Any) -> Array | None:
     return None if pair.friction is None else pair.friction.value
-
-
-@contextmanager
-def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> Iterator[History]:
-    """Record all steps of a problem in a ``with`` block, for gradients through their history (collective).
-
-    Example::
-
-        with uem.recording(problem) as history:
-            for step in uem.load_steps(problem, 10):
-                ...
-        by_E, by_mu = history.gradient(J, [E, uem.ContactParameter(contact, "friction")])
-
-    A record contains the displacement, the history of contactors, laws and inertia, and the changed values of Constants and Functions in
-    the residual.
-
-    Args:
-        problem: in statics or in time; supported are Coulomb friction between nodes of degree 1 and surfaces with sliding='finite', and
-            ``VonMises`` as law with history.
-        scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
-
-    Yields: The history, which may be used in the block and after it.
-
-    Raises:
-        InputError, InputTypeError: for a problem without such derivatives: with mortar and friction, other laws with history or of
-            friction, wear, ties, offsets of contacts with friction, or in time sliding='small'; or if the folder does not exist.
-    """
-    check_problem(problem)
-    with agreed(problem.comm):
-        given.kind("scratch", scratch, scratch is None or isinstance(scratch, (str, Path)), "a folder, or None")
-        if problem.history is not None:
-            raise InputError("the problem is being recorded: expected one history at a time")
-        if is_explicit(problem.dynamics):
-            raise InputError("steps of CentralDifferences have no derivatives: take an implicit scheme, as uem.newmark()")
-        for contact in problem.contacts:
-            if contact.pair.frictional:
-                _check_first(problem, f"those of contact '{contact.name}' with friction")
-                _check_friction(problem, contact)
-            if problem.dynamics is not None and contact.sliding == "small":
-                raise InputError(
-                    f"contact '{contact.name}': a step in time has no derivative by where contactors of sliding='small' were projected: "
-                    "expected 'finite' or 'fixed'"
-                )
-        if problem.dynamics is not None:
-            _check_first(problem, "steps in time")
-        for material in problem.materials:
-            _check_first(problem, "those of a law with history")
-            if not getattr(material, "has_slopes", False):
-                raise InputError(
-                    f"a history has no derivatives through what {type(material).__name__} remembers: expected VonMises "
-                    "without back stresses as law with history; else take differences of runs"
-                )
-        try:
-            history = History(problem, None if scratch is None else Path(scratch))
-        except OSError as error:
-            raise InputError(f"scratch = {scratch!r}: cannot write there ({error}); expected a folder on every rank") from error
-    problem.history = history
-    try:
-        yield history
-    finally:
-        problem.history = None
-
-
-def _check_first(problem: UnitedProblem, what: str) -> None:
-    """Refuse a problem whose steps depend on earlier steps that were not recorded."""
-    if problem.progress.steps:
-        raise InputError(
-            f"the problem has taken {problem.progress.steps} step(s), on which {what} depend: expected a problem that is recorded from its "
-            "first step on"
-        )
-
-
-def _check_friction(problem: UnitedProblem, contact: Any) -> None:
-    """Refuse contacts with friction whose history has no derivatives."""
-    pair, law = contact.pair, as_law(contact.friction)
-    for wrong, expected in (
-        (
-            not pair.discretisation.traits.pointwise or problem.config.degree > 1,
-            "coupling='node_to_surface' and cells of degree 1",
-        ),
-        (contact.sliding != "finite", "sliding='finite'"),
-        (contact.normals != "facet", "normals='facet'"),
-        (type(law) is not Coulomb or law.per_area or law.per_point or follows_load(law), "Coulomb's law, without limit or load"),
-        (pair.friction.wear is not None, "no wear"),
-        (pair.discretisation.setting.offset is not None, "no offset and no adjust"),
-        (not keeps_distance(contact), "a rigid plane, sphere or cylinder"),
-    ):
-        if wrong:
-            raise InputError(
-                f"contact '{contact.name}': a history with friction has derivatives for {expected} alone; else take differences of runs"
-            )

@@ -336,11 +336,14 @@ class Linearised:
             self._refuse_replaced("ties and equations", "the shape")
         return found
 
-    def moved(self, direction: Sequence[tuple[Control, Any]]) -> Motion:
-        """Changes along a direction of controls (collective)."""
+    def moved(self, direction: Sequence[tuple[Control, Any]], gaps: Array | float = 0.0, pushed: Array | float = 0.0) -> Motion:
+        """Changes along a direction of controls (collective).
+
+        ``gaps (m,)`` and ``pushed (n_owned, gdim)``: further changes of the gaps of all equations, and of the residual.
+        """
         config, bodies = self.config, self.problem.bodies
-        forces, prescribed, shape = self.vector(), np.zeros(bodies.free_rows.shape), fem.Function(config.V)
-        gaps = np.zeros_like(self.multipliers)
+        forces, prescribed, shape = self.vector(-np.asarray(pushed)), np.zeros(bodies.free_rows.shape), fem.Function(config.V)
+        gaps = np.zeros_like(self.multipliers) + gaps
         for m, change in direction:
             if isinstance(m, ContactParameter):
                 for entry, size in np.ndenumerate(np.asarray(change, dtype=float)):

@@ -124,9 +124,9 @@ def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array, along: 
     return own.P.gap * longer, work
 
 
-def rubbed(pair: Interface) -> Array:
-    """Derivative of the residual by the coefficient of friction ``(n_owned, gdim)`` (collective)."""
-    nodes, forces = _sliding(pair).frame.ties.handed_on(_rubbed(pair))
+def rubbed(pair: Interface, change: Array | None = None) -> Array:
+    """Derivative of the residual by the coefficient of friction, or along its ``change (n,)``: ``(n_owned, gdim)`` (collective)."""
+    nodes, forces = _sliding(pair).frame.ties.handed_on(_rubbed(pair) * (1.0 if change is None else change[:, None]))
     return pair.config.add_at_owners(nodes, forces)
 
 

@@ -72,7 +72,8 @@ class Sweep:
         """Process a step, with the problem set to its end, and a functional of its end or None (collective)."""
         step = LinearisedStep(self.problem, record, self._derivatives, self._rates)
         with step:
-            handed, self._by_anchors = step.handed_back(self._by_anchors)
+            at_end = self._by_anchors
+            handed, self._by_anchors = step.handed_back(at_end)
             load = (handed + self._by_openings()).ravel()
             if self._rates is not None:
                 self._begin_rates(self._rates, J)
@@ -84,7 +85,7 @@ class Sweep:
             for k, m in enumerate(self._controls):
                 self._add(k, adjoint.by(m))
                 if isinstance(m, ContactParameter):
-                    self._add(k, _left_behind(self.problem, m, handed))
+                    self._add(k, _left_behind(self.problem, m, at_end, step.slopes))
             self._by_anchors = step.by_anchors(adjoint, self._by_anchors)
             self._pass_back_openings(step, adjoint)
             if self._rates is not None:
@@ -155,10 +156,11 @@ class Sweep:
         if not any(pair.frictional for pair in problem.pairs):
             return
         Memory.put_back(first.before, problem)
-        handed, _ = _back(problem, self._by_anchors)
+        slopes = anchor_slopes_of(problem)
+        handed, _ = _back(problem, self._by_anchors, slopes, True)
         for k, m in enumerate(self._controls):
             if isinstance(m, ContactParameter):
-                self._add(k, _left_behind(problem, m, handed))
+                self._add(k, _left_behind(problem, m, self._by_anchors, slopes, True))
             elif isinstance(m, ufl.SpatialCoordinate):
                 self.found[k].x.array[: handed.size] += handed.ravel()
                 self.found[k].x.scatter_forward()
@@ -230,7 +232,8 @@ class LinearisedStep(Linearised):
     def __init__(self, problem: UnitedProblem, record: Record, derivatives: Derivatives, rates: RateSlopes | None):
         super().__init__(problem, derivatives, record.held)
         self._led, self._rates = record.shares, rates
-        self._slopes: list[AnchorSlopes | None] = []
+        #: Derivatives by the anchors of each contact with friction.
+        self.slopes: list[AnchorSlopes | None] = []
         #: Derivative of the work of damping along ``a`` by the velocity ``(n,)``; 0 without damping.
         self.damped: Array | float = 0.0
 
@@ -241,8 +244,8 @@ class LinearisedStep(Linearised):
     def _linearise(self) -> None:
         problem = self.problem
         state, pairs = self._state(), problem.pairs
-        self._slopes = [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(pairs, problem.contacts)]
-        if state.rows.independent is not None and state.rows.independent.found and any(self._slopes):
+        self.slopes = anchor_slopes_of(problem)
+        if state.rows.independent is not None and state.rows.independent.found and any(self.slopes):
             raise InputError(
                 "equations of contactors with friction conflict with each other or with Dirichlet conditions, and have been replaced by "
                 "others, through which histories have no derivatives; let nodes be contactors of one contact, with free normals"
@@ -254,22 +257,26 @@ class LinearisedStep(Linearised):
         K = self.K
         back = transposed(K) if not is_symmetric(K, self.config.unknowns) else K
         self._K_back, self._G_back = back, None if self.G is None else transposed(self.G)
-        problem.solver.set_operator(self.Q, self._K_back, self._G_back, None if self.Q is self.P else self.P)
+        self.set_operator()
         self._tell_idle()
+
+    def set_operator(self) -> None:
+        """Set the matrix ``P'(K + G)'Q`` of the adjoint problem (collective)."""
+        self.problem.solver.set_operator(self.Q, self._K_back, self._G_back, None if self.Q is self.P else self.P)
 
     def __exit__(self, *error: object) -> None:
         solver = self.problem.solver
-        if solver.iterative or not solver.lasting or any(self._slopes):
+        if solver.iterative or not solver.lasting or any(self.slopes):
             self.problem.system.forget()
 
     def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
         """As in ``Linearised``, with the terms of friction (collective)."""
-        pairs, slopes = [self.problem.pairs[k] for k in which], [self._slopes[k] for k in which]
+        pairs, slopes = [self.problem.pairs[k] for k in which], [self.slopes[k] for k in which]
         states, like = [pair.trial for pair in pairs], self.config.unknowns.vector()
         for pair, own in zip(pairs, slopes):
             pair.trial = pair.trial if own is None else own.without_stuck()
         try:
-            curvature = together(curvature_of(in_question(pairs), like, any(self._slopes), False), self.stiffness_of_gaps(which))
+            curvature = together(curvature_of(in_question(pairs), like, any(self.slopes), False), self.stiffness_of_gaps(which))
         finally:
             for pair, state in zip(pairs, states):
                 pair.trial = state
@@ -298,13 +305,13 @@ class LinearisedStep(Linearised):
 
     def handed_back(self, by_anchors: list[Array]) -> tuple[Any, list[Array]]:
         """Derivatives by final positions, from derivatives by final anchors, and by the anchors that are unchanged (collective)."""
-        return _back(self.problem, by_anchors, self._slopes)
+        return _back(self.problem, by_anchors, self.slopes)
 
     def by_anchors(self, adjoint: Adjoint, kept: list[Array]) -> list[Array]:
         """Derivatives by the initial anchors of the step, including unchanged anchors (collective)."""
         n, g = self.config.n_owned, self.config.gdim
         a, first, found = adjoint.a.x.array[: n * g].reshape(n, g), 0, []
-        for slopes, own, before in zip(self._slopes, self.equations, kept):
+        for slopes, own, before in zip(self.slopes, self.equations, kept):
             part = adjoint.by_gaps[first : first + len(own)]
             first += len(own)
             found.append(before if slopes is None else slopes.by_anchors(part, own, a) + before)
@@ -320,25 +327,35 @@ def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) ->
     return 0.0 if found is None else found
 
 
+def anchor_slopes_of(problem: UnitedProblem) -> list[AnchorSlopes | None]:
+    """Derivatives by anchors in the present trial states, None without friction (collective)."""
+    return [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(problem.pairs, problem.contacts)]
+
+
 def _back(
-    problem: UnitedProblem, by_anchors: list[Array], slopes: Sequence[AnchorSlopes | None] | None = None
+    problem: UnitedProblem, by_anchors: list[Array], slopes: Sequence[AnchorSlopes | None], first: bool = False
 ) -> tuple[Array, list[Array]]:
     """Derivatives by positions of the owned nodes ``(n_owned, gdim)``, from derivatives by anchors, and by unchanged ones (collective)."""
-    first = slopes is None
-    if slopes is None:
-        slopes = [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(problem.pairs, problem.contacts)]
     handed, left = np.zeros((problem.config.n_owned, problem.config.gdim)), []
-    for own, at, pair in zip(by_anchors, slopes, problem.pairs):
+    for own, at in zip(by_anchors, slopes):
         if at is not None:
-            places, own = at.back(own if own.size else np.zeros((len(pair.nodes), at.size)), first)
+            places, own = at.back(own, first)
             handed += places
         left.append(own)
     return handed, left
 
 
-def _left_behind(problem: UnitedProblem, m: ContactParameter, handed: Array) -> Array:
-    """Derivatives by a motion of the target, from derivatives ``handed`` by positions of contactors relative to it (collective)."""
-    found = np.zeros(m.shape(problem.config.gdim))
-    for entry in np.ndindex(found.shape) if m.parameter in ("place", "turn") else ():
-        found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()
+def _left_behind(
+    problem: UnitedProblem,
+    m: ContactParameter,
+    by_anchors: list[Array],
+    slopes: Sequence[AnchorSlopes | None],
+    first: bool = False,
+) -> Array:
+    """Derivatives by a motion of the target, from derivatives by anchors, the positions of its contactors relative to it (collective)."""
+    found, k = np.zeros(m.shape(problem.config.gdim)), problem.contacts.index(m.contact)
+    if m.parameter in ("place", "turn") and (at := slopes[k]) is not None:
+        handed, _ = at.back(by_anchors[k], first)
+        for entry in np.ndindex(found.shape):
+            found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()
     return np.asarray(reduced(problem.comm, found))

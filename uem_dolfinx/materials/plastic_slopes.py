@@ -1,11 +1,11 @@
-"""Derivatives of load steps of a law with history by the initial history and by the law's parameters; in reverse mode only.
+"""Derivatives of load steps of a law with history by the initial history and by the law's parameters, in both modes.
 
 Derivatives by fields at quadrature points are densities: per volume of the point.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class PlasticSlopes:
         self._V, self._load = a.function_space, forms.form(ufl.dot(self._pulled, along(test)) * points.dx)
         n = points.volumes.size
         self._by_stress = np.zeros((n, size))
-        #: Derivatives by plastic strain and peeq at the end of the step, after ``pass_back`` at its beginning.
+        #: Derivatives by plastic strain and peeq at the end of the step, after ``pass_back`` at its beginning; forwards their changes.
         self._by_history = np.zeros((n, size)), np.zeros(n)
         self._state: tuple[Array, ...] = ()
 
@@ -109,3 +109,59 @@ class PlasticSlopes:
         found.x.array[compat.cell_dofs(m.function_space)[points.cells, 0]] = of_cells
         found.x.scatter_forward()
         return found
+
+
+class PlasticChanges(PlasticSlopes):
+    """Changes through the steps of one law along a direction, from the first to the last; arguments as of ``PlasticSlopes``.
+
+    The derivatives of a return in reverse mode, for each of its results in turn, are the rows of its Jacobian.
+    """
+
+    def begin_along(self, direction: Sequence[tuple[Any, Any]]) -> tuple[Array, fem.Function]:
+        """Begin a step, with the law set to its end, along changes of parameters as passed to the law (collective).
+
+        Returns:
+            Changes at the same displacement, of the residual by the stress ``(n,)``, and of ``bulk``.
+        """
+        self._state = self._law.begins_with()
+        k, n = self._by_stress.shape[1], len(self._by_stress)
+        units = np.broadcast_to(np.eye(2 * k + 1)[:, None], (2 * k + 1, n, 2 * k + 1))
+        self._rows = [self._back(*self._state, unit[:, :k], unit[:, k : 2 * k], unit[:, -1]) for unit in units]
+        changes, known = {name: np.zeros(n) for name in self._law.handed}, self._law.parameters
+        for name, value in self._law.handed.items():
+            for m, change in direction:
+                if m is value:
+                    changes[name] += self._at_points(m, change)
+        E, nu = changes["E"] / known["E"], changes["nu"]
+        # of the logarithms of E / (1 + nu), E / (1 - nu) and E / 3 / (1 - 2 nu)
+        logs = E - nu / (1 + known["nu"]), E + nu / (1 - known["nu"]), E + 2 * nu / (1 - 2 * known["nu"])
+        self._explicit = np.stack(
+            [
+                row.shear * logs[0] + row.area * logs[1] + row.yield_stress * changes["yield_stress"] + row.hardening * changes["hardening"]
+                for row in self._rows
+            ]
+        )  # fmt: skip
+        self._points.write(self._pulled, self._after(np.zeros((n, k)))[:, :k])
+        bulk = fem.Function(self.bulk.function_space)
+        at = compat.cell_dofs(bulk.function_space)[self._points.cells, 0]
+        bulk.x.array[at] = self.bulk.x.array[at] * logs[2].reshape(self._points.volumes.shape)[:, 0]
+        bulk.x.scatter_forward()
+        return forms.assemble_array(self._V, self._load), bulk
+
+    def end(self) -> None:
+        """End the step, with a, the change of the displacement (collective)."""
+        found, k = self._after(self._points.evaluate(self._along_a)), self._by_stress.shape[1]
+        self._by_history = found[:, k : 2 * k], found[:, -1]
+
+    def _after(self, strain: Array) -> Array:
+        """Changes of stress, plastic strain and peeq after the return, with a change of the strain ``(n, 2 k + 1)``."""
+        plastic, peeq = self._by_history
+        parts = [(row.strain * strain + row.plastic_strain * plastic).sum(axis=1) + row.peeq * peeq for row in self._rows]
+        return np.asarray((np.stack(parts) + self._explicit).T)
+
+    def _at_points(self, m: Any, change: Any) -> Array:
+        """Change of a parameter at the points ``(n,)``."""
+        shape = self._points.volumes.shape
+        if isinstance(m, fem.Constant):
+            return np.full(shape[0] * shape[1], float(change))
+        return np.repeat(change.x.array[compat.cell_dofs(change.function_space)[self._points.cells, 0]], shape[1])

@@ -367,11 +367,12 @@ class VonMises(given.Sealed):
         """The Function of the stress in ``residual``: its deviator, or in plane stress the whole stress."""
         return self._s
 
-    def slopes(self, a: fem.Function, test: Any) -> PlasticSlopes:
-        """Derivatives through load steps, for gradients through histories; arguments as in ``PlasticSlopes`` (collective)."""
-        from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
+    def slopes(self, a: fem.Function, test: Any, onward: bool = False) -> PlasticSlopes:
+        """Derivatives through load steps, backwards or ``onward``; arguments as in ``PlasticSlopes`` (collective)."""
+        from uem_dolfinx.materials.plastic_slopes import PlasticChanges, PlasticSlopes
 
-        return PlasticSlopes(self, self._points, self._s, self._kappa, lambda w: self._vector(self._variation(w)), a, test)
+        mode = PlasticChanges if onward else PlasticSlopes
+        return mode(self, self._points, self._s, self._kappa, lambda w: self._vector(self._variation(w)), a, test)
 
     def _refuse_infinite(self, stress: Array) -> None:
         """NotFiniteError on all ranks if a stress at this rank's points ``(n_points, size)`` is not finite (collective)."""
