@@ -120,6 +120,8 @@ def test_imports_point_one_way():
 BUDGETS = {
     "members of the seam": 31, "members of Interface": 87, "heuristics": 14, "arrows within contact": 75, "arrows within solve": 39,
     "lines of the package": 56967,
+    "members of the seam": 31, "members of Interface": 94, "heuristics": 14, "arrows within contact": 75, "arrows within solve": 39,
+    "lines of the package": 56763,
 }  # fmt: skip
 
 

@@ -14,12 +14,13 @@ import ufl
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+from uem_dolfinx.accuracy.first_guess import carry_over, refuse_first_guess
 from uem_dolfinx.accuracy.goal import GoalError, goal_error
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.errors import InputError, MeshError
+from uem_dolfinx.errors import ConvergenceError, InputError, MeshError
 from uem_dolfinx.geometry.mesh_sizes import MeshSizes
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_steps import load_steps
 from uem_dolfinx.solve.united.newton import Iteration
@@ -85,6 +86,7 @@ def adapt(
     cells: int | None = None,
     goal: Callable[[UnitedProblem], ufl.Form] | None = None,
     solve: Callable[[UnitedProblem], Any] | None = None,
+    solve_again: Callable[[UnitedProblem], Any] | None = None,
     meshes: int = 10,
 ) -> Adaptation:
     """Solve a problem on meshes that follow its estimated error, finer and coarser, until it is small enough (collective).
@@ -99,13 +101,17 @@ def adapt(
         cells: or the number of cells, which are spent where they serve most.
         goal: returns a functional of a problem's displacement, of which the error over its value is estimated instead, see ``goal_error``.
         solve: solves a problem, e.g. ``lambda problem: list(uem.load_steps(problem, 10))``; by default in one load step.
+        solve_again: solves the problem of every mesh after the first, which begins with the displacement of the mesh before,
+            e.g. ``lambda problem: problem.solve()``, at the full load at once. The solution must not depend on the path; where it
+            is not found, ``solve`` solves the problem from its beginning.
         meshes: largest number of meshes.
 
     Returns:
         The last problem, its estimate, and a line for each mesh.
 
     Raises:
-        InputError, InputTypeError: for wrong arguments, neither or both of ``tolerance`` and ``cells``, or what ``error_estimate`` refuses.
+        InputError, InputTypeError: for wrong arguments, neither or both of ``tolerance`` and ``cells``, what ``error_estimate`` refuses,
+            or ``solve_again`` with laws that have a history, friction or cohesion.
         InputError: if the goal is zero on a mesh, e.g. a force on what nothing touches, so that no error can be over it.
         MeshError: if the cells do not follow the sizes, since the geometry fixes them.
 
@@ -121,7 +127,8 @@ def adapt(
     """
     given.kind("make", make, callable(make), "a function of the size of cells that returns a UnitedProblem")
     given.kind("goal", goal, goal is None or callable(goal), "a function of the problem that returns a UFL form, or None")
-    given.kind("solve", solve, solve is None or callable(solve), "a function of the problem, or None")
+    for name, one in (("solve", solve), ("solve_again", solve_again)):
+        given.kind(name, one, one is None or callable(one), "a function of the problem, or None")
     if (tolerance is None) == (cells is None):
         raise InputError("adapt: expected either a tolerance or a number of cells")
     tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))
@@ -131,11 +138,10 @@ def adapt(
     # Gmsh makes fewer cells in space, and more where they have to grow slowly
     expected, scale, whole = 0.0, 1.0, 0.0
     found: list[AdaptedMesh] = []
+    problem: UnitedProblem | None = None
     while True:
         start = perf_counter()
-        problem = make(size)
-        given.kind("what make returns", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
-        steps = list(load_steps(problem, 1)) if solve is None else solve(problem)
+        problem, steps = _solved(make, size, solve, problem, solve_again)
         estimate = error_estimate(problem) if goal is None else goal_error(problem, goal(problem))
         if np.isnan(estimate.relative):
             raise InputError(
@@ -216,6 +222,29 @@ def cell_sizes(mesh: Any) -> Array:
     edges = np.array(forms.reference_topology(cell)[1])
     x = mesh.geometry.x[compat.geometry_dofs(mesh)[:n]]
     return np.asarray(np.linalg.norm(x[:, edges[:, 1]] - x[:, edges[:, 0]], axis=2).mean(axis=1))
+
+
+def _solved(
+    make: Callable[[MeshSizes | None], UnitedProblem],
+    size: MeshSizes | None,
+    solve: Callable[[UnitedProblem], Any] | None,
+    before: UnitedProblem | None,
+    solve_again: Callable[[UnitedProblem], Any] | None,
+) -> tuple[UnitedProblem, Any]:
+    """The problem of a mesh, solved, and the steps of it; ``before``: the problem of the mesh before (collective)."""
+    problem = make(size)
+    given.kind("what make returns", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
+    if solve_again is not None:
+        with agreed(problem.comm):
+            refuse_first_guess(problem)
+        if before is not None:
+            carry_over(before, problem)
+            try:
+                return problem, solve_again(problem)
+            except (ConvergenceError, ArithmeticError) as error:
+                logger.info("no solution from the displacement of the mesh before, so solve starts over: %s", error)
+            problem = make(size)
+    return problem, list(load_steps(problem, 1)) if solve is None else solve(problem)
 
 
 def _measured(problem: UnitedProblem, estimate: ErrorEstimate | GoalError, steps: Any, start: float) -> AdaptedMesh:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from mpi4py import MPI
-
 import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx import compat, forms, given
+from uem_dolfinx import compat, given
 from uem_dolfinx.accuracy.enriched import Enriched
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.geometry.bodies import body_sums, find_bodies
+from uem_dolfinx.geometry.bodies import bodies_in_order, body_sums
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -78,22 +76,13 @@ def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
     with timed("estimate errors"):
         enriched = Enriched(problem)
         squared = enriched.energies()
-        sums = _by_body(problem, squared)
+        body, count = bodies_in_order(config)
+        of_cells = body[compat.cell_dofs(config.V)[: len(squared), 0]]
+        sums = body_sums(config.comm, squared[:, None], of_cells, count)[:, 0]
         cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="error_estimate")
         cells.x.array[: len(squared)] = np.sqrt(squared)
         cells.x.scatter_forward()
     return ErrorEstimate(float(np.sqrt(sums.sum())), float(np.sqrt(enriched.energy)), np.sqrt(sums), cells, squared)
-
-
-def _by_body(problem: UnitedProblem, values: Array) -> Array:
-    """Sums of cells' values over each body, in the order of the mesh's input (collective)."""
-    config = problem.config
-    body, count = find_bodies(config)
-    of_cells = body[compat.cell_dofs(config.u.function_space)[: len(values), 0]]
-    first, number = np.full(count, np.iinfo(np.int64).max), forms.original_cells(config.mesh)[: len(values)]
-    np.minimum.at(first, of_cells[: len(number)], number)
-    order = np.argsort(reduced(config.comm, first, op=MPI.MIN), kind="stable")
-    return body_sums(config.comm, values[:, None], of_cells, count)[order, 0]
 
 
 def refuse_estimate(problem: UnitedProblem) -> None:

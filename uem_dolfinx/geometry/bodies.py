@@ -11,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 from dolfinx import fem
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.geometry.nodes import Nodes, described
 from uem_dolfinx.parallel import reduced
@@ -107,6 +107,17 @@ def _components(n: int, links: Ints) -> tuple[int, Ints]:
     graph = coo_matrix((np.ones(len(links)), links.T), shape=(n, n))
     count, label = connected_components(graph, directed=False)
     return int(count), label.astype(np.int64)
+
+
+def bodies_in_order(nodes: Nodes) -> tuple[Ints, int]:
+    """As ``find_bodies``, numbered in the order in which their cells come in the mesh's input (collective)."""
+    body, count = find_bodies(nodes)
+    n = nodes.mesh.topology.index_map(nodes.mesh.topology.dim).size_local
+    of_cells, number = body[compat.cell_dofs(nodes.V)[:n, 0]], forms.original_cells(nodes.mesh)[:n]
+    first = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(first, of_cells[: len(number)], number)
+    order = np.argsort(reduced(nodes.comm, first, op=MPI.MIN), kind="stable")
+    return np.asarray(np.argsort(order)[body]), count
 
 
 def body_sums(comm: MPI.Comm, values: Array, body: Ints, count: int) -> Array:
