@@ -45,6 +45,8 @@ class NodeToSurface(OnTarget):
     ends_hold: bool | Bools = True
     #: Contactors that something else holds, so that they must not touch the target ``(n,)``, or None.
     left_out: Bools | None = None
+    #: In place of ``ConcaveEdges``, see ``follow_by``.
+    _edges: Any = None
     #: Which contactors are left to other equations, see ``leave``; None: none are.
     _leaves: Callable[[FacetProjection], Bools] | None = None
 
@@ -58,14 +60,20 @@ class NodeToSurface(OnTarget):
         how: dict[str, Any] = {"sliding": other.sliding, "thickness": other.thickness}
         return cls(other.config, other.nodes, other.target, free=other.setting.free, **how)
 
-    @cached_property
+    @property
     def concave_edges(self) -> ConcaveEdges | None:
         """Tracking of contactors from facet to facet; None for targets with continuous normals."""
         if self.sliding != "finite" or not self.target.faceted:
             return None
+        if self._edges is not None:
+            return self._edges
         from uem_dolfinx.contact.nodes.concave_edges import ConcaveEdges
 
         return ConcaveEdges(self)
+
+    def follow_by(self, edges: Any) -> None:
+        """Track contactors by another object than ``ConcaveEdges``, with its methods."""
+        self._edges = edges
 
     def set(self, **changed: Any) -> None:
         """See ``OnTarget`` (collective)."""

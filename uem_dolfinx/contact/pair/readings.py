@@ -184,6 +184,11 @@ class Readings:
         """Whether contactors may follow each other."""
         return self.discretisation.traits.chained or (self.tie is not None and self.tie.chained)
 
+    @property
+    def works(self) -> bool:
+        """Whether its forces do external work, for example on a moving rigid target."""
+        return self.target.motion is not None or (self.tie is not None and self.tie.works)
+
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without loads (collective)."""
         return None if self.tie is None else self.tie.applied_forces()

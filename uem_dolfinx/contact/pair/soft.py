@@ -33,6 +33,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.laws.soft import SoftContact
 from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, with_averaged_normals
+from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Violations
 from uem_dolfinx.contact.seam.dyads import Terms, grouped
@@ -61,8 +62,6 @@ def stiffness_of_gaps(pair: Interface, stiffness: Array) -> tuple[Ints, Ints, Ar
 
 class _Edges:
     """In place of ``ConcaveEdges``: facets press alone, also in corners; contactors that alternate between them get averaged normals."""
-
-    free = offset = mu = None
 
     def place(self, nearest: Any, points: Array, state: PairState) -> tuple[Any, None]:
         """Projection of all contactors, and no corners."""
@@ -99,8 +98,8 @@ class SoftInterface(Interface):
         self._law, self._contact, self._duration = law, contact, duration
         #: Damping over the length of the step, gaps at its beginning, and gaps s from which on pressures vanish ``(n,)``, or None.
         self._damped: tuple[Array, Array, Array] | None = None
-        if getattr(self.discretisation, "concave_edges", None) is not None:
-            self.discretisation.concave_edges = _Edges()  # type: ignore[attr-defined]
+        if isinstance(self.discretisation, NodeToSurface):
+            self.discretisation.follow_by(_Edges())
         n = len(self.nodes)
         self.trial = self.committed = replace(self.committed, law_gap=np.full(n, np.inf))
         #: Gaps at which the law gives the forces, multipliers and stiffnesses of the rows there, areas, and contactors whose gap is held

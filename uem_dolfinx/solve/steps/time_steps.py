@@ -29,7 +29,6 @@ from uem_dolfinx.solve.united.newton import Iteration
 from uem_dolfinx.solve.united.system import CLOSED
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.restart.checkpoint import Checkpoint
 
 #: Rounding of a time, a few units in its last place.
@@ -217,12 +216,7 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
     """Contact forces on both bodies, at this rank's nodes, of each contact that should do no work (collective)."""
     closed = compress(problem.contacts, touching(problem))
     own = slice(problem.config.gdim * problem.config.n_owned)
-    return [np.array(c.force.x.array[own]) for c in closed if not _works(c.pair)]
-
-
-def _works(pair: Interface) -> bool:
-    """Whether its forces do external work, for example on a moving rigid target."""
-    return pair.target.motion is not None or (pair.tie is not None and pair.tie.works)
+    return [np.array(c.force.x.array[own]) for c in closed if not c.pair.works]
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
