@@ -94,7 +94,9 @@ class OnTarget:
 
     def _turning(self, found: Any, points: Array) -> Any:
         """The projection with facets continued behind concave edges, so that gaps do not change to first order as all bodies turn."""
-        behind = found.behind_edges(points) if isinstance(found, FacetProjection) and self.target.faceted else []
+        if not (isinstance(found, FacetProjection) and self.target.faceted):
+            return found
+        behind = found.behind_edges(points)
         return self.target.continued(found, behind, points[behind]) if len(behind) else found
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
