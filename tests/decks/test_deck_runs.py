@@ -9,7 +9,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from deck_scenes import columns, written
+from deck_scenes import columns, deck, grid, node_sets, written
+from dolfinx import fem
 from helpers import refused
 
 import uem_dolfinx as uem
@@ -100,6 +101,27 @@ def test_friction_that_steps_change(folder, expected, mu, changes, how, soft):
     assert not any("FRICTION" in one for one in deck.left_out)
     assert [abs(pulled[f"step {k}"][0]) / p for k in (2, 3, 4)] == pytest.approx(expected, abs=1e-6)
     assert pulled["step 4"][2] == pytest.approx(p, rel=1e-6)
+
+
+def test_hexahedra_on_tetrahedra(folder):
+    """A cube of hexahedra tied onto one of tetrahedra that does not match: linear displacements are exact."""
+    (x, name, cells), (other_x, other, other_cells) = grid("tetra", 1, 2), grid("hexahedron", 1, 3)
+    points, nu, e = np.vstack([x, other_x + [0.0, 0.0, 1.0]]), 0.3, 0.005
+    places = points.T
+    first = np.arange(len(points)) < len(x)
+    sets = {"low": first & (places[2] == 1.0), "high": ~first & (places[2] == 1.0), "bottom": places[2] == 0.0}
+    sets |= {"top": places[2] == 2.0, "left": places[0] == 0.0, "front": places[1] == 0.0}
+    text = node_sets({name: np.flatnonzero(own) for name, own in sets.items()}) + STEEL.replace(", 0.0", f", {nu}")
+    text += (
+        f"*SOLID SECTION, ELSET={name}, MATERIAL=STEEL\n*SOLID SECTION, ELSET={other}, MATERIAL=STEEL\n*TIE, NAME=T\nhigh, low\n"
+    )
+    text += f"*BOUNDARY\nbottom, 3\nleft, 1\nfront, 2\n*STEP\n*STATIC\n*BOUNDARY\ntop, 3, 3, {-2 * e}\n*END STEP\n"
+    tied = uem.read_deck(deck(folder, "tied.inp", points, {name: cells, other: other_cells + len(x)}, text), COMM)
+    list(tied.run())
+    exact = fem.Function(tied.u.function_space)
+    exact.interpolate(lambda x: np.stack([nu * e * x[0], nu * e * x[1], -e * x[2]]))
+    assert np.abs(tied.u.x.array - exact.x.array).max(initial=0.0) <= 1e-12
+    assert "hexahedron, tetra: divided into triangles or tetrahedra" in tied.left_out
 
 
 @pytest.mark.parametrize("kind", ["C3D8", "CPE4", "CPS4", "CAX4"])

@@ -141,6 +141,19 @@ def test_refused(what):
     refused(uem.InputError, words, lambda: uem.gradient(problem, s.J, control))
 
 
+@pytest.mark.parametrize("cell, n, expected", [("triangle", 2, 3), ("triangle", 3, 2), ("tetrahedron", 2, 9)])
+def test_contactors_on_edges(cell, n, expected, caplog):
+    """On a flat target the shape has one-sided derivatives where contactors lie on edges or ends of facets; it says so, with a place."""
+    b = blocks(COMM, cell, 2, n)
+    v, kind = ufl.TestFunction(b.V), "plane_strain" if b.gdim == 2 else "3d"
+    F = uem.LinearElastic(1.0, 0.3, kind=kind).residual(b.u, v) * ufl.dx
+    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.01), contacts=[uem.Contact(b.high, b.low)], rtol=1e-12)
+    problem.solve()
+    uem.gradient(problem, ufl.inner(b.u, b.u) * ufl.dx, ufl.SpatialCoordinate(b.scene.mesh))
+    told = [record.getMessage() for record in caplog.records if "edges between facets" in record.getMessage()]
+    assert COMM.rank > 0 or (len(told) == 1 and f": {expected} contactor(s), the first at (" in told[0])
+
+
 def test_nodes_that_moved_in_a_history():
     """Steps are swept over with the nodes where they are: if these have moved between steps, there is no gradient."""
     s = pressed()

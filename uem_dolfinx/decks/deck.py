@@ -369,7 +369,8 @@ def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
     ``*BOUNDARY``, ``*CLOAD``, pressures by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``, ``*CONTACT PAIR``, ``*TIE``,
     ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of contact pairs and
     ``*PRE-TENSION SECTION``, whose surface is cut; steps ``*STATIC``, ``*HEAT TRANSFER`` and
-    ``*COUPLED TEMPERATURE-DISPLACEMENT``. All else is in ``left_out`` and in the log.
+    ``*COUPLED TEMPERATURE-DISPLACEMENT``. Cells of several kinds, prisms and pyramids are divided into simplices.
+    All else is in ``left_out`` and in the log.
 
     Args:
         path: of the input file.
@@ -391,7 +392,13 @@ def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
             raise MissingFileError(f"input file {path} does not exist")
         numbers = read_numbers(file)
         kept["model"] = model_of(numbers)
-        raw = raw_of(found_of(numbers, file), file)
+        found = found_of(numbers, file)
+        # sections and ties may join kinds of cells, of which a mesh has one
+        kinds = {block.base for block in found.bodies}
+        several = len(kinds) != 1 or kinds <= {"wedge", "pyramid"}
+        if several:
+            kept["model"].left_out.append(f"{', '.join(sorted(kinds))}: divided into triangles or tetrahedra")
+        raw = raw_of(found, file, simplices=several)
         for surface, *_ in kept["model"].pretension:
             raw = cut(raw, surface)
         nodes = np.array(sorted(numbers.nodes), dtype=np.int64)

@@ -83,6 +83,8 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
     from uem_dolfinx.gradients.linearised import Linearised
 
     with Linearised(problem) as linearised:
+        if any(isinstance(m, ufl.SpatialCoordinate) for m in some):
+            linearised.warn_of_edges()
         adjoint = Adjoint(linearised, revolved(J), pressing)
         return [adjoint.by(m) for m in some]
 
@@ -116,6 +118,8 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]],
     from uem_dolfinx.gradients.linearised import Linearised
 
     with Linearised(problem) as linearised:
+        if any(isinstance(m, ufl.SpatialCoordinate) for m, _ in pairs):
+            linearised.warn_of_edges()
         motion = linearised.moved(pairs)
         return motion.du if contact is None else linearised.pressed(contact, motion)
 

@@ -46,6 +46,8 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.search import ON_SIDE
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.contact_fields import along_field
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
@@ -54,7 +56,7 @@ from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
 from uem_dolfinx.gradients.shape_slopes import ShapeSlopes, shape_slopes_of
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import reduced
+from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies.norms import ratio
 from uem_dolfinx.solve.bodies.tangent import curvature_of, slip_terms, together
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -185,6 +187,23 @@ class Linearised:
                 "%d contactor(s) have neither force nor gap: the functional has another gradient on either side, and this is that of "
                 "the contactors that are active now", idle,
             )  # fmt: skip
+
+    def warn_of_edges(self) -> None:
+        """Warn of contactors on edges between facets, where derivatives by the shape are one-sided (collective)."""
+        for contact, pair in zip(self.problem.contacts, self.problem.pairs):
+            p, place = getattr(pair.kinematics, "projection", None), np.full(3, np.nan)
+            on = np.zeros(len(pair.nodes), dtype=bool)
+            if isinstance(p, FacetProjection) and contact.coupling == "node_to_surface" and not contact.tied:
+                on = pair.trial.active & (pair.target.shape.side_distances(p.xi) < ON_SIDE).any(axis=1)
+                place[: self.config.gdim] = self.config.X[pair.nodes[on][0]] if on.any() else np.nan
+            if count := reduced(self.config.comm, int(on.sum())):
+                places = gathered(self.config.comm, place)[:, : self.config.gdim]
+                first = places[np.isfinite(places).all(axis=1)][0]
+                logger.warning(
+                    "contact '%s': %d contactor(s), the first at (%s), lie on edges between facets of the target, whose normals change "
+                    "differently on either side: derivatives by the shape are one-sided", contact.name, count,
+                    ", ".join(f"{x:.6g}" for x in first),
+                )  # fmt: skip
 
     def __exit__(self, *error: object) -> None:
         solver = self.problem.solver
