@@ -99,12 +99,8 @@ class Dynamics(given.Sealed):
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
         self.resumed, self.accelerated, self.moving, self._attached = 0, False, False, False
-        #: Length of the last step.
-        self._last = 0.0
-        self.driven = 0.0
-        self.dt = 0.0
-        #: Factor of M in the tangent.
-        self.factor = 0.0
+        #: Length of the last committed step, and the factor of M in the tangent.
+        self._last = self.factor = self.driven = self.dt = 0.0
         #: Masses at points of rigid couplings.
         self.added: list[AddedMass] = []
         #: Virtual work of the damping forces.
@@ -393,6 +389,10 @@ class Dynamics(given.Sealed):
         for one in self.added:
             one.commit()
         self._copy_committed()
+
+    def end_with(self, velocity: Array, acceleration: Array) -> None:
+        """Set velocity and acceleration of free components at the end of the present explicit step, before its ``commit`` ``(n,)``."""
+        self._v_rate, self._v_past[: self._n], self._a_past[: self._n] = 0.0, velocity, acceleration
 
     def change_rates(self, velocity: Array, acceleration: Array) -> None:
         """Replace velocity and acceleration of free components of the committed state, at the same momentum ``(n,)`` (collective)."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from uem_dolfinx import errors
+from uem_dolfinx.dynamics.scheme import MOST_GIVEN, SHORTEST_GIVEN
 from uem_dolfinx.log import logger
 
 #: A step may be cut to this part of its nominal length.
@@ -39,13 +40,14 @@ class StepControl:
         number: number of completed steps.
         largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
         largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
-        due: number of the step after which explicit steps find the critical step anew.
+        due: number of the step after which explicit steps look at how fast edges of cells are stretched.
+        stretch: of these until then, since the critical step was found.
         resolved: bound on the length of explicit steps that resolve contacts on a stiff surface.
     """
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
-        self._cuts, self._read, self._longest_before, self.due, self.resolved = 0, False, np.inf, 0, np.inf
+        self._cuts, self._read, self._longest_before, self.due, self.stretch, self.resolved = 0, False, np.inf, 0, 0.0, np.inf
 
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
@@ -79,6 +81,30 @@ class StepControl:
         logger.info("step %d failed (%s); cut to %.3g", self.number + 1, error, self.longest)
         return True
 
+    def too_much(
+        self, given: float, length: float, kinetic: Callable[[], float], held: Callable[[], float] = float
+    ) -> str | None:
+        """Words for an energy that contacts give the bodies in a step beyond the limit, or None (collective).
+
+        Args:
+            given: the energy.
+            length: of the step.
+            kinetic: returns the kinetic energy of the bodies.
+            held: returns other energy at work.
+        """
+        if given <= MOST_GIVEN * self.largest_energy:
+            return None
+        self.largest_energy = max(self.largest_energy, kinetic())
+        if given <= MOST_GIVEN * (at_work := self.largest_energy + held()):
+            return None
+        return f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {at_work:.3g}"
+
+    def refuse_energy(self, words: str, length: float, again: bool = False) -> None:
+        """Refuse a step in which contacts give too much energy, or warn of it where the step is short and not better ``again``."""
+        if length > SHORTEST_GIVEN * self.nominal or again:
+            raise errors.EnergyGivenError(words)
+        logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)
+
     def give_up(self) -> None:
         """After a final failure, reset the length to its value before the failed step."""
         self.longest = self._longest_before
@@ -104,14 +130,15 @@ class StepControl:
             "nominal length": self.nominal,
             "largest speed": self.largest_speed,
             "critical step due": self.due,
+            "stretch of cells": self.stretch,
             "resolved step": self.resolved,
         }
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
         # files of earlier versions lack these
-        kept = {"largest speed": 0.0, "critical step due": 0, "resolved step": np.inf} | kept
-        self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due, self.resolved = (
-            kept[name] for name in self.to_checkpoint()
-        )
+        kept = {"largest speed": 0.0, "critical step due": 0, "stretch of cells": np.inf, "resolved step": np.inf} | kept
+        (
+            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due, self.stretch, self.resolved
+        ) = (kept[name] for name in self.to_checkpoint())  # fmt: skip
         self._read, self._longest_before = True, self.longest

@@ -18,8 +18,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.explicit.critical import highest_eigenvalue
 from uem_dolfinx.dynamics.explicit.surface import SurfaceSolver
-from uem_dolfinx.dynamics.scheme import MOST_GIVEN, SHORTEST_GIVEN
-from uem_dolfinx.errors import EnergyGivenError, MassError, StepAccuracyError
+from uem_dolfinx.errors import InvertedElementError, MassError, StepAccuracyError
 from uem_dolfinx.parallel import gathered, reduced
 
 #: A surface at rest makes the square of the highest frequency much larger if by more than this factor: contacts then change the step.
@@ -29,12 +28,16 @@ STIFF_SURFACE = 1.25
 #: most this part of the critical one with closed contacts, so that they resolve the bounce.
 #: [convention; critical step; test_explicit.py::test_a_thin_layer_at_the_wall]
 RESOLVED = 0.25
-#: The critical step is found anew after so many steps at most, since bodies may yield or turn.
+#: How fast edges of cells are stretched is found anew after so many steps at most.
 #: [convention; steps; test_explicit_materials.py::test_cells_that_are_flattened]
 CHECKED_EVERY = 50
-#: It is found anew before the velocities stretch a cell by more than this part, and where accelerations change that by as much in a step.
+#: The critical step is found anew before an edge is stretched by more than this part, and where a step does that; cells are checked for
+#: inversion before nodes move by this part of the shortest edge against each other.
 #: [convention; strain; test_explicit_materials.py::test_cells_that_are_flattened]
 CHECKED_STRAIN = 0.1
+#: A run ends where the shortest edge of all cells falls below this part of the mesh's shortest one: cells collapse, and steps with them.
+#: [bound; the shortest edge; -]
+COLLAPSED = 1e-3
 #: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from.
 #: [format; wave numbers; -]
 IRRATIONAL = 1e3 * np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
@@ -67,8 +70,20 @@ class ExplicitStepper:
         self.limit = np.inf
         #: Part of the critical step that resolves closed contacts.
         self.part = 1.0
-        #: Whether contacts change the critical step, and the shortest edge of a cell when it was last found.
-        self.of_contact, self._shortest = False, np.inf
+        #: Whether contacts change the critical step.
+        self.of_contact = False
+        config = problem.config
+        n_vertices, dofs = len(forms.reference_topology(compat.cell_name(config.mesh))[0]), compat.cell_dofs(config.V)
+        pairs = np.sort(dofs[:, np.array(np.triu_indices(n_vertices, 1))].transpose(0, 2, 1).reshape(-1, 2), axis=1)
+        #: Pairs of vertices of a cell ``(2, n)``, and, as last looked at, their shortest distance, the fastest rate of stretching and the
+        #: mean velocity of nodes.
+        self._edges = np.array(np.divmod(np.unique(pairs @ [len(config.x), 1]), len(config.x)))
+        self._shortest, self.rate, self._mean = np.inf, 0.0, np.zeros(config.gdim)
+        self._of_mesh = self._lengths(config.X)
+        self._least = COLLAPSED * reduced(problem.comm, float(self._of_mesh.min(initial=np.inf)), op=MPI.MIN)
+        #: How far nodes may have moved against each other since cells were checked for inversion, and whether accelerations may have
+        #: stretched them much in the last step.
+        self._moved, self.sudden = np.inf, False
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
 
     def begin(self) -> None:
@@ -96,11 +111,11 @@ class ExplicitStepper:
             self.surface.predict(start)
             history = problem.attempt(start=start)
             a = self._accelerations()
-        self._refuse_long(dt, a, before)
+        self._refuse_cells(dt, a, before)
         self._refuse_given_energy(dt)
         self.surface.learn(history)
+        dynamics.end_with(half + 0.5 * dt * a, a)
         problem.commit()
-        dynamics.change_rates(np.where(self.moving, half + 0.5 * dt * a, dynamics.velocity.x.array[:n]), a)
         return history
 
     def _accelerations(self) -> Array:
@@ -135,8 +150,8 @@ class ExplicitStepper:
                 c = max(self._highest_square() - k, 0.0) / np.sqrt(k)
         return float(4.0 / (c + np.sqrt(c**2 + 4.0 * k)))
 
-    def _refuse_long(self, dt: float, a: Array, before: tuple[int, ...]) -> None:
-        """Refuse a step beyond the critical one of the state at its end, if this differs much from the state before (collective).
+    def _refuse_cells(self, dt: float, a: Array, before: tuple[int, ...]) -> None:
+        """Refuse a step that turns a cell inside out, or is beyond the critical one of a state that differs much (collective).
 
         Args:
             dt: length of the step.
@@ -144,12 +159,25 @@ class ExplicitStepper:
             before: ``pattern`` at its beginning.
 
         Raises:
+            InvertedElementError: with the place.
             StepAccuracyError: with both lengths.
         """
-        problem = self.problem
-        if changed := not problem.bodies.linear:
-            largest = reduced(problem.comm, float(np.abs(a).max(initial=0.0)), op=MPI.MAX)
-            changed = 2.0 * largest * dt**2 > CHECKED_STRAIN * self._shortest
+        problem, bodies, config, changed = self.problem, self.problem.bodies, self.problem.config, False
+        if not bodies.linear or bodies.inversions:
+            way = config.of(problem.u.x.array - problem.committed)[: config.n_owned] - dt * self._mean
+            sizes = np.array([np.abs(a).max(initial=0.0), np.abs(way).max(initial=0.0)])
+            largest, moved = reduced(problem.comm, sizes, op=MPI.MAX)
+            least = CHECKED_STRAIN * self._shortest
+            self.sudden = not bodies.linear and 2.0 * largest * dt**2 > least
+            self._moved += 2.0 * np.sqrt(config.gdim) * moved
+            if self.sudden:
+                length, start = self._lengths(config.x), self._lengths(config.X + config.of(problem.committed))
+                strain = float((np.abs(length - start) / start).max(initial=0.0))
+                changed = reduced(problem.comm, strain, op=MPI.MAX) > CHECKED_STRAIN
+            if changed or self._moved > least:
+                if (where := bodies.inverted()) is not None:
+                    raise InvertedElementError(f"the cell at {where} is turned inside out: take a finer mesh there")
+                self._moved = 0.0
         if not changed and self.pattern() == before:
             return
         critical = self.critical_step()
@@ -169,15 +197,9 @@ class ExplicitStepper:
         for pair in problem.interfaces:
             opened = pair.committed.active & ~pair.trial.active
             given += 0.5 * float((pair.committed.lam * np.maximum(pair.gap, 0.0))[opened].sum()) if opened.any() else 0.0
-        given = reduced(problem.comm, given)
-        if given <= MOST_GIVEN * control.largest_energy:
-            return
-        control.largest_energy = max(control.largest_energy, self.dynamics.kinetic_energy())
-        if given > MOST_GIVEN * control.largest_energy and dt > SHORTEST_GIVEN * control.nominal:
-            raise EnergyGivenError(
-                f"contacts that open give the bodies {given:.3g} of energy within a step of {dt:.3g}, which have had "
-                f"{control.largest_energy:.3g}"
-            )
+        words = control.too_much(reduced(problem.comm, given), dt, self.dynamics.kinetic_energy)
+        if words is not None:
+            control.refuse_energy(words, dt)
 
     def _highest_square(self) -> float:
         """Square of the highest frequency by the present tangent (collective).
@@ -200,17 +222,41 @@ class ExplicitStepper:
         self.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
         return condensed if stiff else fixed
 
-    def steps_to_check(self, dt: float) -> int:
-        """Number of steps of length ``dt`` after which the critical step is found anew (collective)."""
+    def _lengths(self, of: Array) -> Array:
+        """Lengths of the differences of nodal values ``(n_local, gdim)`` along all edges ``(n,)``."""
+        return np.asarray(np.linalg.norm(of[self._edges[0]] - of[self._edges[1]], axis=1))
+
+    def look(self, stretch: float = np.inf) -> float:
+        """Find how fast the velocities stretch edges of cells, and the shortest edge (collective).
+
+        Args:
+            stretch: of edges since the critical step was found, as far as known.
+
+        Returns:
+            This stretch, or that since the start if this is less than changes the critical step.
+
+        Raises:
+            InvertedElementError: if this is a small part of the shortest one of the mesh.
+        """
         config = self.problem.config
-        n_vertices = len(forms.reference_topology(compat.cell_name(config.mesh))[0])
-        v, vertices = self.dynamics.velocity.x.array.reshape(-1, config.gdim), compat.cell_dofs(config.V)[:, :n_vertices]
-        one, other = vertices[:, np.array(np.triu_indices(n_vertices, 1))].transpose(1, 0, 2)
-        speed, length = (np.linalg.norm(of[one] - of[other], axis=2) for of in (v, config.x))
-        rates = [float((speed / length).max(initial=0.0)), float((1.0 / length).max(initial=0.0))]
-        rate, inverse = reduced(self.problem.comm, np.array(rates), op=MPI.MAX)
-        strain, self._shortest = dt * rate, 1.0 / inverse
-        return int(np.clip(CHECKED_STRAIN / strain, 1, CHECKED_EVERY)) if strain > 0.0 else CHECKED_EVERY
+        v = self.dynamics.velocity.x.array.reshape(-1, config.gdim)
+        length = self._lengths(config.x)
+        found = self._lengths(v) / length, 1.0 / length, np.abs(length / self._of_mesh - 1.0)
+        self.rate, inverse, strain = reduced(self.problem.comm, np.array([of.max(initial=0.0) for of in found]), op=MPI.MAX)
+        self._shortest = 1.0 / inverse
+        self._mean = reduced(self.problem.comm, v[: config.n_owned].sum(axis=0)) / config.index_map.size_global
+        if self._shortest < self._least:
+            raise InvertedElementError(
+                f"cells collapse: their shortest edge, {self._least / COLLAPSED:.3g} at the start, is {self._shortest:.3g}; "
+                "take a finer mesh, or lower speeds"
+            )
+        return float(strain) if strain < CHECKED_STRAIN else stretch
+
+    def steps_to_look(self, dt: float, stretch: float) -> int:
+        """Number of steps of length ``dt`` until edges are stretched as far as they may, of which ``stretch`` is done; 0 for none."""
+        strain = dt * self.rate
+        left = max(CHECKED_STRAIN - stretch, 0.0)
+        return int(min(left / strain, CHECKED_EVERY)) if strain > 0.0 else CHECKED_EVERY
 
     def _highest(self, apply: Callable[[Array], Array]) -> float:
         config, mass = self.problem.config, self._mass * self.moving

@@ -70,6 +70,7 @@ class Bodies:
         wanted: prescribed values at the unknowns with Dirichlet conditions, ghosts included ``(n,)``.
         tangent: K.
         points: loads and springs at nodes, or None.
+        inversions: search for cells turned inside out, or None.
         stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, for estimates of rounding in forces; None until known.
     """
 
@@ -85,10 +86,9 @@ class Bodies:
         check_inversion: bool | None = None,
         J: ufl.Form | None = None,
     ):
-        self.config, self.comm, self.u = config, config.comm, config.whole
+        self.config, self.comm, self.u, self.F = config, config.comm, config.whole, F
         self.unknowns = config.unknowns
         self.materials, self.dynamics, self.points = list(materials), dynamics, points
-        self.F = F
         self.tangent = Tangent(F, config, self.materials, dynamics, points, J)
         with compiling("the residual"):
             self._F = forms.form(F)
@@ -98,7 +98,6 @@ class Bodies:
         #: Unknowns at which the residual is assembled under the present loads ``(n,)``, for the next call of ``assemble``; or None.
         self._assembled_at: Array | None = None
         self.hold(bcs)
-        self.dead: Array | None = None
         #: Writes F at the present displacement to a vector.
         self._assemble: Callable[[PETSc.Vec], None] = partial(forms.assemble_vector, L=self._F)
         if dynamics is not None:
@@ -107,13 +106,14 @@ class Bodies:
             dynamics.hold(~self.free[: config.n_owned])
             self._assemble = explicit_forces(self, self._F, J) or self._assemble
         self.wanted: Array = np.array(self.u.x.array)
+        self.dead: Array | None = None
         self.stiffness: Array | None = None
         #: Its value at the end of the last step, which the next step starts with.
         self.stiffness_at_start: Array | None = None
         #: State counter of the values of K that ``stiffness`` was taken from.
         self._stiffness_of = -1
         check = not self.tangent.linear if check_inversion is None else check_inversion
-        self._inversions = Inversions(config) if check and config.moves else None
+        self.inversions = Inversions(config) if check and config.moves else None
         self._fields: Any = None
         if self.unknowns.mixed:
             from uem_dolfinx.solve.bodies.field_scales import FieldScales
@@ -392,7 +392,7 @@ class Bodies:
 
     def inverted(self) -> str | None:
         """Position of an inverted cell, or None (collective)."""
-        return self._inversions.find() if self._inversions is not None else None
+        return self.inversions.find() if self.inversions is not None else None
 
     # -- checkpoints ---------------------------------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ class InertBodies(Bodies):
     def __init__(self, bodies: Bodies, mass: Array):
         self.__dict__.update(bodies.__dict__)
         self._mass, self._b = mass, compat.create_vector(bodies.u.function_space)
-        self.materials, self.points, self.dead, self._assembled_at = [], None, None, None
+        self.materials, self.points, self.dead, self._assembled_at, self.inversions = [], None, None, None, None
         # lines of a node have the same columns, as in K
         g = bodies.config.gdim
         K = PETSc.Mat().createAIJ(bodies.tangent.K.getSizes(), bsize=g, nnz=g, comm=bodies.comm)
@@ -99,9 +99,9 @@ class StepperWithMass(ExplicitStepper):
         self.dynamics.begin(1.0)
         a = self._accelerations()
         self.dynamics.restore()
-        self.problem.keep()
-        self._change_rates(np.array(self.dynamics.velocity.x.array[: self._n]), a)
+        self.dynamics.change_rates(np.array(self.dynamics.velocity.x.array[: self._n]), a)
         self.dynamics.accelerated = True
+        self.problem.keep()
 
     def step(self, dt: float) -> Any:
         """Take a step of length ``dt`` and commit it; returns the history of iterations for contact (collective)."""
@@ -124,19 +124,13 @@ class StepperWithMass(ExplicitStepper):
             problem.restore()
             raise
         a = self._accelerations()
-        self._refuse_long(dt, a, ())
+        self._refuse_cells(dt, a, ())
         half, kick = (problem.u.x.array[:n] - begin) / dt, 0.5 * dt * a
         # contact takes part in the change of the velocity, and the next step starts with the velocity in its middle all the same
         taken = self._along_contact(kick) if history[-1].active or problem.linear is not None else kick
+        dynamics.end_with(half + taken, a + (kick - taken) * 2.0 / dt)
         problem.commit()
-        self._change_rates(np.where(self.moving, half + taken, dynamics.velocity.x.array[:n]), a + (kick - taken) * 2.0 / dt)
         return history
-
-    def _change_rates(self, v: Array, a: Array) -> None:
-        """Set velocities and accelerations ``(n,)`` at the end of a step; parts that couplings make rigid keep momenta (collective)."""
-        self.dynamics.change_rates(v, a)
-        if self.problem.linear is not None:
-            self.problem.linear.settle(self.dynamics)
 
     def _along_contact(self, change: Array) -> Array:
         """Change of velocities ``(n,)`` by a kick and the impulses of contact and equations (collective)."""

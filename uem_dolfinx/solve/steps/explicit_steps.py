@@ -41,10 +41,10 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         stepper.begin()
     length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), stepper.pattern()
     control.begin(length)
-    stepper.steps_to_check(length)
+    stepper.look()
     if not resumed:
         # bodies that touch deform from the first step on
-        control.due = control.number + 1
+        control.due, control.stretch = control.number + 1, 0.0
     while (remainder := end - dynamics.time) > LEFT * length:
         taken = min(length if remainder >= (1.0 - LEFT) * length else remainder, control.longest)
         try:
@@ -66,12 +66,16 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         last = pattern
         yield TimeStep(number, dynamics.time, taken, iterations, cuts, *events(problem, before, after))
         # bodies that meet deform from now on
-        due = not problem.bodies.linear and (number >= control.due or after != before)
-        before = after
-        if due or (pattern := stepper.pattern()) != last:
-            length = _length(stepper, dt, end)
-            control.due = number + stepper.steps_to_check(length)
+        due = not problem.bodies.linear and (number >= control.due or after != before or stepper.sudden)
+        before, found = after, (pattern := stepper.pattern()) != last
+        if due or found:
+            control.stretch = stepper.look(control.stretch)
+        if found or (due and not stepper.steps_to_look(length, control.stretch)):
+            length, control.stretch = _length(stepper, dt, end), 0.0
             control.begin(length)
+        if due or found:
+            steps = max(stepper.steps_to_look(length, control.stretch), 1)
+            control.due, control.stretch = number + steps, control.stretch + steps * length * stepper.rate
 
 
 def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:

@@ -15,8 +15,7 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.dynamics.scheme import MOST_GIVEN, SHORTEST_GIVEN
-from uem_dolfinx.errors import EnergyGivenError, InputError, PrecisionError, SpaceError, StepAccuracyError, UEMError
+from uem_dolfinx.errors import InputError, PrecisionError, SpaceError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -241,13 +240,9 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
     config = problem.config
     way = config.of(problem.u.x.array - problem.committed)[: config.n_owned].ravel()
     given = reduced(problem.comm, 0.5 * float(sum(f @ way for f in forces)))
-    if given <= MOST_GIVEN * control.largest_energy:
+    words = control.too_much(given, length, dynamics.kinetic_energy, lambda: _held_by(problem, forces))
+    if words is None:
         return
-    control.largest_energy = max(control.largest_energy, dynamics.kinetic_energy())
-    at_work = control.largest_energy + _held_by(problem, forces)
-    if given <= MOST_GIVEN * at_work:
-        return
-    words = f"contacts give the bodies {given:.3g} of energy within a step of {length:.3g}, which have {at_work:.3g}"
     if dynamics.contactors != "massless":
         logger.warning("%s, from time %.6g: their contactors have mass; take contactors='massless'", words, dynamics.time)
         return
@@ -261,9 +256,7 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
                 count,
                 dynamics.time,
             )
-    if length > SHORTEST_GIVEN * control.nominal or any(barred):
-        raise EnergyGivenError(words)
-    logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)
+    control.refuse_energy(words, length, any(barred))
 
 
 def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
