@@ -267,12 +267,11 @@ def test_what_is_refused():
     """What does not go with a soft contact is named; so are laws that are none."""
     b = blocks(COMM, "quadrilateral", 2, 3)
     soft = uem.SoftContact(1.0)
-    heat = uem.Conductance(1.0, field=1)
     for what, how in (
         ("friction", {"friction": 0.3}),
         ("wear", {"wear": 1e-3}),
         ("tied", {"tied": True}),
-        ("heat", {"heat": heat}),
+        ("heat with h = inf", {"heat": uem.Conductance(np.inf, field=1)}),
     ):
         refused(
             uem.InputError,

@@ -369,9 +369,9 @@ class Contact(WatchedContact, given.Sealed):
             how = {"tag": self.contactor, "areas": self.surface, "lower": self._offsets_of_pair().wear, "name": self.name}
             friction.wear = Wear(config, nodes, self._wear, **how)
         if self.heats:
-            from uem_dolfinx.contact.thermal.heat import heats_of
+            from uem_dolfinx.contact.pair.kinds import heats_of_kind
 
-            self._pair.heats = heats_of(self._pair, self.heats, self)
+            self._pair.heats = heats_of_kind(self)
         warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
         return self._pair
 

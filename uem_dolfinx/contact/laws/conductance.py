@@ -33,7 +33,8 @@ class Conductance(given.Sealed):
     Args:
         h: conductance, a power per area and temperature difference. A number applies where surfaces touch, and open gaps conduct no
             heat; infinity makes temperatures equal where surfaces touch. A function ``h(p, g)`` is called with the contact
-            pressures and gaps of all contactors, ``(n,)`` each, both 0 or positive and one of them 0, and returns ``(n,)`` numbers.
+            pressures and gaps of all contactors, ``(n,)`` each, both 0 or positive and one of them 0, and returns ``(n,)`` numbers. In
+            a soft contact it gets both at once, gaps negative where surfaces overlap, and a number applies under pressure.
             A function ``h(p, g, T, T_target)`` of four arguments also gets the temperatures of both sides, ``(n,)`` each.
         field: number of the part of the mixed space that is the temperature, scalar Lagrange of the displacement's degree or less.
         temperature: of a rigid target, a number or a Constant; None for a meshed target, which has its own.

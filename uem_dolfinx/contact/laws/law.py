@@ -106,11 +106,18 @@ def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], ti
 
     Raises:
         InputTypeError: for another type.
-        InputError: for a soft contact with friction, wear, heat or a tie.
+        InputError: for a soft contact with friction, wear, perfect conductance, heat of currents, or a tie.
     """
     given.kind("normal", normal, normal is None or hasattr(normal, "pressures"), "a SoftContact, or None for hard contact")
     slides = isinstance(friction, dict) or as_law(friction).field != 0.0
-    for what, there in (("friction", slides), ("wear", callable(wear) or wear), ("heat", heats), ("tied", tied)):
+    others = (
+        ("friction", slides),
+        ("wear", callable(wear) or wear),
+        ("heat with h = inf", any(one.perfect for one in heats)),
+        ("heat with joule", any(one.joule is not None for one in heats)),
+        ("tied", tied),
+    )
+    for what, there in others:
         if normal is not None and there:
             raise InputError(
                 f"{what} does not go with normal = {normal!r}, whose contactors are not constrained to the target: leave it out"

@@ -1,4 +1,4 @@
-"""Kinds of interfaces and of ties that a contact's laws ask for; they are imported where they are used."""
+"""Kinds of interfaces, of ties and of heat flows that a contact's laws ask for; they are imported where they are used."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from uem_dolfinx.contact.seam.placement import Discretisation
 from uem_dolfinx.errors import InputError
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.thermal.heat import Heat
     from uem_dolfinx.contact.ties.tie import Tie
 
 
@@ -49,6 +50,14 @@ def kind_of_interface(contact: Any, duration: Callable[[], float] | None) -> Cal
 
         kind = cohesive.CohesiveInterface if contact.cohesion.bonds else adhesive.AdhesiveInterface
     return partial(kind, law=law, contact=contact)
+
+
+def heats_of_kind(contact: Any) -> list[Heat]:
+    """Heat flows of a contact, hard or soft; see ``thermal.heat.heats_of`` (collective)."""
+    from uem_dolfinx.contact.thermal import heat, soft_heat
+
+    kind = heat.Heat if contact.normal is None else soft_heat.SoftHeat
+    return heat.heats_of(contact.pair, contact.heats, contact, kind)
 
 
 def tie_of(contact: Any, nodes: Indices, discretisation: Discretisation, means: Any, **of: Any) -> Tie | None:

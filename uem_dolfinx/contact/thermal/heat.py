@@ -274,20 +274,22 @@ class Heat:
         return np.where((closed | ~pair.off) & self.passage.leads, h, 0.0)
 
     def _slopes(self, *which: int) -> list[Array]:
-        """Derivatives of the power by some arguments of h, each ``(n,)`` (collective).
-
-        The pressure, argument 0, changes at closed contactors, and the gap, argument 1, at open ones.
-        """
-        state, closed = self._state(), self.pair.united
+        """Derivatives of the power by some arguments of h, each ``(n,)`` (collective)."""
+        state = self._state()
         largest = reduced(self.pair.config.comm, np.array([np.abs(part).max(initial=0.0) for part in state]), op=MPI.MAX)
-        every = np.ones(len(closed), dtype=bool)
-        changes = closed, ~closed & (self.pair.projection.gap > 0.0), every, every
+        every = np.ones(len(self.pair.nodes), dtype=bool)
+        changes = *self._moving(), every, every
         here, scale, found = self._conductances(*state), self.jump() * self.passage.areas, []
         for k in which:
             more = np.where(changes[k], OF_CONDUCTANCE * largest[k], 0.0)
             ahead = self._conductances(*state[:k], state[k] + more, *state[k + 1 :])
             found.append(np.asarray((ahead - here) / np.where(more > 0.0, more, 1.0) * scale))
         return found
+
+    def _moving(self) -> tuple[Bools, Bools]:
+        """Contactors at which the pressure changes, those that are closed, and at which the gap changes, open ones ``(n,)`` each."""
+        closed = self.pair.united
+        return closed, ~closed & (self.pair.projection.gap > 0.0)
 
     def jump(self) -> Array:
         """Temperature of contactors minus temperature of the target ``(n,)`` (collective)."""
@@ -348,16 +350,20 @@ class Heat:
 
     def changes(self) -> list[tuple[Array, Terms]]:
         """Derivatives of the power by temperatures and gaps: scales ``(n,)`` of linear functions of the unknowns (collective)."""
-        at, pair = self.passage, self.pair
+        at = self.passage
         if self.law.perfect:
             return []
         found = [(self.conductances() * at.areas, self.jumps())]
         if callable(self.law.h):
-            opening = Terms(at.row, at.node, at.jump[:, None] * pair.projection.normal[at.row])
             sides = [self._terms(self._of, self._shares(side)) for side in (at.own, at.theirs) if self.law.of_temperatures]
-            by_gaps, *others = self._slopes(*range(1, 2 + len(sides)))
-            found += [(np.where(pair.united, 0.0, by_gaps), opening), *zip(others, sides)]
+            found += [self._by_gaps(), *zip(self._slopes(*range(2, 2 + len(sides))), sides)]
         return found
+
+    def _by_gaps(self) -> tuple[Array, Terms]:
+        """Derivatives of the power by open gaps ``(n,)``, and these as linear functions of the unknowns (collective)."""
+        at, pair = self.passage, self.pair
+        opening = Terms(at.row, at.node, at.jump[:, None] * pair.projection.normal[at.row])
+        return np.where(pair.united, 0.0, self._slopes(1)[0]), opening
 
     def by_pressures(self) -> Array:
         """Derivatives of the power by the pressures of closed contactors ``(n,)`` (collective)."""
@@ -415,7 +421,7 @@ class Heat:
         return Terms(row, number // g, vector)
 
 
-def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared) -> list[Heat]:
+def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared, kind: type[Heat]) -> list[Heat]:
     """Heat flows of an interface by several conductances; adds columns for perfect ones to its state (collective).
 
     Raises:
@@ -424,7 +430,7 @@ def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared) -> list
     columns = np.cumsum([law.perfect for law in laws])
     if columns[-1]:
         pair.trial = pair.committed = replace(pair.committed, heat=np.zeros((len(pair.nodes), columns[-1])))
-    heats = [Heat(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
+    heats = [kind(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
     for heat in heats:
         if heat.law.joule is not None:
             heat.sources.append(JouleHeat([one for one in heats if one.law.field == heat.law.joule], heat.law.joule_share))
