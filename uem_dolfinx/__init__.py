@@ -45,9 +45,9 @@ __all__ = [
     "OutputError", "OverdeterminedError", "PenetrationError", "PointLoad", "PointSpring", "Power", "PowerLaw", "PrecisionError", "Preload",
     "Resultant", "Results", "ResultsWriter", "RigidCoupling", "RigidCylinder", "RigidParaboloid", "RigidPlane", "RigidSphere",
     "RigidSurface", "Scheme", "Slider", "SoftContact", "SpaceError", "Spring", "StVenantKirchhoff", "State", "Step", "StepAccuracyError",
-    "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "ThrownBodyError", "TimeStep", "Tresca", "TunnellingError",
-    "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "ViscousFriction", "Voce", "VonMises", "adapt", "animate",
-    "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx",
+    "Stribeck", "SurfaceError", "SurfaceWriter", "Tag", "TagError", "Tags", "Thirion", "ThrownBodyError", "TimeStep", "Tresca",
+    "TunnellingError", "UEMError", "UnitedProblem", "UserFunctionError", "Vibrations", "ViscousFriction", "Voce", "VonMises", "adapt",
+    "animate", "assemble_matrix", "assemble_vector", "axisymmetric", "consistent_mass", "dirichlet", "displacement_gradient", "ds", "dx",
     "error_estimate", "errors", "example_mesh", "figure", "form", "function_space", "generalised_alpha", "goal_error", "gradient",
     "integrate", "interpolate", "load_steps", "lumped_mass", "modes", "multigrid_options", "newmark", "nodal_mass", "outline", "periodic",
     "plot_energies", "plot_history", "plot_pressure", "plot_scene", "plot_setup", "read_checkpoint", "read_deck", "read_gmsh", "read_mesh",
@@ -135,6 +135,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.laws.stribeck import Stribeck
     from uem_dolfinx.contact.laws.thermal import OfTemperature
+    from uem_dolfinx.contact.laws.thirion import Thirion
     from uem_dolfinx.contact.laws.viscous import ViscousFriction
     from uem_dolfinx.contact.preload import Preload
     from uem_dolfinx.decks.deck import Deck, read_deck
@@ -171,6 +172,7 @@ if _TYPE_CHECKING:
 #: Modules that are imported on first use of one of their names.
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "SoftContact": "contact.laws.soft",
+    "Thirion": "contact.laws.thirion",
     "Exponential": "contact.laws.exponential", "PowerLaw": "contact.laws.power_law",
     "Adhesion": "contact.laws.adhesion",
     "Leak": "contact.laws.leak",

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem, mesh
-from helpers import at, box, linear, raised, scene
+from helpers import at, box, linear, raised, scene, slow
 from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
@@ -52,6 +52,7 @@ LAWS = {
     "stress": uem.Coulomb(0.3, limit=2.0),
     "force": uem.Coulomb(0.3, force=0.5),
     "Tresca": uem.Tresca(2.0),
+    "Thirion": uem.Thirion(0.3, 2.0),
     "stiction": uem.Stribeck(0.3, 0.2),
     "Stribeck": uem.Stribeck(0.3, 0.2, 0.5, viscous=0.1),
     "growing": uem.Stribeck(0.2, 0.4, 0.5),
@@ -100,6 +101,31 @@ def test_limits_of_coulombs_law(coupling):
     raised(uem.InputError, "contact 'sole': a limit of the force", lambda: Dragged(uem.Coulomb(0.3, force=1.0)))
     raised(uem.InputError, "contact 'sole': Coulomb needs areas", lambda: Dragged(uem.Coulomb(0.3, limit=1.0), points=True))
     raised(uem.InputError, "give one of them", lambda: uem.Coulomb(0.3, limit=1.0, force=1.0))
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", slow("hexahedron")])
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_a_coefficient_by_the_pressure(coupling, cell):
+    """Where contactors slip the force on each is ``mu p A / (1 + mu p / stress)``; the limits are Coulomb's and Tresca's laws."""
+    stress = 2e-3
+    block = Dragged(uem.Thirion(0.3, stress), coupling=coupling, cell=cell)
+    last, contact = block.run()[-1], block.contact
+    lam, tangential = contact.pressing()
+    area, borne = contact.measured_areas(), np.linalg.norm(tangential, axis=1)
+    expected = 0.3 * lam / (1.0 + 0.3 * lam / np.where(area > 0.0, stress * area, 1.0))
+    assert contact.pair.friction.slipping(contact.pair.trial).all()
+    assert borne == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    # at this pressure by more than half
+    assert 0.0 < -last[0] < 0.5 * 0.3 * last[-1] and contact.dissipation > 0.0
+    for law, limit in ((uem.Thirion(0.3, 1e6), 0.3), (uem.Thirion(1e9, stress), uem.Tresca(stress))):
+        ends = [Dragged(one, coupling=coupling, cell=cell).run()[-1] for one in (law, limit)]
+        np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-6 * np.abs(ends[1]).max())
+
+
+def test_thirion_is_refused():
+    """A stress that is not positive, and points, which have no area."""
+    raised(uem.InputError, "stress", lambda: uem.Thirion(0.3, 0.0))
+    raised(uem.InputError, "contact 'sole': Thirion needs areas", lambda: Dragged(uem.Thirion(0.3, 1.0), points=True))
 
 
 def test_stiction_in_statics():

@@ -80,7 +80,7 @@ class Contact(WatchedContact, given.Sealed):
         friction: Coulomb's coefficient: a number, a function of points ``(3, n)`` of the reference configuration that returns
             ``(n,)``, a function of these and of the load factor or time at the end of the step, a scalar Function of the
             displacement's nodes, whose values every step reads, or an ``OfTemperature``. Or a law of
-            friction with any of these as parameter: ``Coulomb`` with a limit, ``Tresca``, ``Stribeck``. With 0 the contact is
+            friction with any of these as parameter: ``Coulomb`` with a limit, ``Tresca``, ``Thirion``, ``Stribeck``. With 0 it is
             frictionless. If the contact was made with friction, it may be changed between steps, by the same law. Other settings,
             except ``offset``, cannot be changed once a problem has been made.
         wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of position as for ``friction``.
