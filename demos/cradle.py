@@ -22,7 +22,7 @@ Options:
 # \qquad r_k(t) = \frac{(t - t_k)\, c}{2 L} \text{ within 0 and 1}
 # $$
 #
-# is the part of the momentum that it has handed on, and bar k has the mean velocity v (r_(k-1) - r_k), with r_0 = 1 for the first
+# is the part of the momentum that it has handed on. Bar k has the mean velocity v (r_(k-1) - r_k), with r_0 = 1 for the first
 # and r_N = 0 for the last. In the end the last bar has v, and the others rest without vibration.
 #
 # All contacts are one declaration, `GeneralContact`, of the ends of the bars.

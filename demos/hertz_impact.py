@@ -11,8 +11,8 @@ Options:
 # %% [markdown]
 # # A ball bounces
 #
-# While waves cross the ball much faster than it bounces, the contact is that of two bodies at rest, with the force
-# k d^1.5 by Hertz for an approach d, k = 4/3 E* sqrt(R). So the ball touches for the time 2.9432 d / v, with
+# While waves cross the ball much faster than it bounces, the contact is that of two bodies at rest. By Hertz
+# the force is k d^1.5 for an approach d, with k = 4/3 E* sqrt(R). So the ball touches for the time 2.9432 d / v, with
 # d^2.5 = 15 m v^2 / (16 E* sqrt(R)) at the turn.
 #
 # The half section is axisymmetric. Central differences move the nodes with mass; the surface around the lowest point has none and

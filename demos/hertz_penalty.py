@@ -9,7 +9,7 @@ Options:
 # %% [markdown]
 # # A rigid indenter, with and without a penalty
 #
-# A rigid paraboloid of radius R = 0.5 is pressed by d = 0.02 into an elastic block, of which a quarter is modelled,
+# A rigid paraboloid of radius R = 0.5 is pressed by d = 0.02 into an elastic block. A quarter of it is modelled,
 # [0, 1]^2 x [-1, 0], with hexahedra that get smaller towards the origin. The surface z = 0 must stay below the indenter,
 #
 # $$

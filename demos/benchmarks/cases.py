@@ -26,8 +26,8 @@ COMM = MPI.COMM_WORLD
 
 #: What counts as right, for all methods alike: forces and works to 1 %, overlaps to 1e-3 of the smallest element at the contact.
 FORCE, OVERLAP, BALANCE = 1e-2, 1e-3, 1e-3
-#: A method that has spent more than so many Newton iterations for each planned load step without coming to the end, or so many
-#: times the time steps, counts as one that does not converge.
+#: A method does not converge if it has spent more Newton iterations than this for each planned load step, or more time steps than this
+#: times the planned ones, and is not at the end.
 PATIENCE = 20
 #: Newton iterations that a cut step has spent.
 LOST = 50

@@ -23,7 +23,7 @@ from uem_dolfinx.geometry.shapes import closest_point, unit_normals
 
 #: Facets that are as near as the nearest, but for this part of an element, share in the cone of normals at a vertex.
 AS_NEAR = 1e-3
-#: Forces of mortar have a potential. Where a mesh ends over a facet they lean by the gap there over the size of the facet, and between
+#: Forces of mortar have a potential. Where a mesh ends over a facet they lean by the gap there over the size of the facet. Between
 #: facets that lean they also act on the neighbours of the node that touches, by the gap and the lean over the size.
 LEAN = 1e-2
 #: A contactor that is past the end of the target by less than this part of an element may still bear on the end.

@@ -77,12 +77,12 @@ class Contact(WatchedContact, given.Sealed):
         max_penetration: bound on the initial penetration, a length; None is 5 % of the model's size.
         thickness: of the body behind a meshed target, a length: a contactor that has slid off the target's end and is deeper than
             this lies behind the body, not in it. None: the body is treated as infinitely thick.
-        friction: Coulomb's coefficient: a number, a function of points ``(3, n)`` of the reference configuration that returns
-            ``(n,)``, a function of these and of the load factor or time at the end of the step, a scalar Function of the
-            displacement's nodes, whose values every step reads, or an ``OfTemperature``. Or a law of
-            friction with any of these as parameter: ``Coulomb`` with a limit, ``Tresca``, ``Thirion``, ``Stribeck``. With 0 it is
-            frictionless. If the contact was made with friction, it may be changed between steps, by the same law. Other settings,
-            except ``offset``, cannot be changed once a problem has been made.
+        friction: Coulomb's coefficient: a number, or a function of reference positions ``(3, n)`` that returns ``(n,)``, with a
+            second argument also of the load factor or time at the end of the step. Or a scalar Function of the displacement's
+            nodes, which every step reads, or an ``OfTemperature``. Or a law with any of these as parameter: ``Coulomb`` with a
+            limit, ``Tresca``, ``Thirion``, ``Stribeck``. With 0 it is frictionless. If the contact was made with friction, it may be
+            changed between steps, by the same law. Other settings, except ``offset``, cannot be changed once a problem has been
+            made.
         wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of position as for ``friction``.
             After every step the worn volume of the contactor is ``wear N s`` for the force N that slips by s, with friction or
             without, and gaps are larger by the worn depth. Results are :attr:`wear` and :attr:`worn_volume`. The target does not

@@ -1,7 +1,7 @@
 """Derivatives of the return to the von Mises yield surface by its initial values, in reverse mode and in closed form.
 
-Given the derivatives of a functional by stress s, plastic strain and peeq after a return, ``(n, k)``, ``(n, k)`` and ``(n,)``, its
-derivatives by strain, history and parameters follow. Yielding points are kept.
+The derivatives of a functional by strain, history and parameters follow from those by stress s, plastic strain and peeq after a return,
+``(n, k)``, ``(n, k)`` and ``(n,)``. Yielding points are kept.
 """
 
 from __future__ import annotations

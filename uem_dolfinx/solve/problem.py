@@ -299,9 +299,9 @@ class UnitedProblem(given.Sealed):
         """Bring the bodies into equilibrium and commit the state (collective).
 
         The load factor is 1, or in dynamics the time is the present one, for ``load`` and all functions of equations, couplings, preloads
-        and friction. Within a loop over ``load_steps`` or ``time_steps`` the step is repeated from its initial state and its result
-        replaced, at the same load factor or time, under the present loads, Dirichlet values and fields. Histories of friction and
-        plasticity, and velocities, count one step, however often it is repeated.
+        and friction. Within a loop over ``load_steps`` or ``time_steps`` the step is repeated from its initial state, at the same
+        load factor or time, under the present loads, Dirichlet values and fields. The result replaces the previous one. Histories
+        of friction and plasticity, and velocities, count one step, however often it is repeated.
 
         Arguments, return value and errors are as in :meth:`attempt`, with loads of the factor ``fraction``. Loads are unchanged with a
         ``start``, or if ``set_load`` has set them since the last step. If the repeated step fails, the previous result is kept.

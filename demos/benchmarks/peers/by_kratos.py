@@ -3,9 +3,9 @@
 Small strain, but the segments move with the bodies. Kratos' contact settings are its defaults but for tolerances and the number of
 iterations. Its multipliers are scalars and unknowns of the linear system, which GMRES with AMGCL's smoothed aggregation solves to the
 tolerance: on 3,000 nodes that took 5 s where Eigen's SparseLU took 14. Multipliers with components, which Kratos 10.4.4 condenses, took
-21 s with SparseLU; for AMGCL with blocks its settings were refused ("direct_settings" is not in the defaults), and named so that they
-are not looked at it ended with "Invalid solver index: 2", as neither the condensed nor the whole system was solved, or with normals
-that are no numbers. Seconds are those of the processor, taken inside, from nodes, cells and surfaces in memory to the solution.
+21 s with SparseLU. For AMGCL with blocks its settings were refused ("direct_settings" is not in the defaults). Under another name, which
+Kratos ignores, the run ended with "Invalid solver index: 2", or with normals that are no numbers. Seconds are those of the processor,
+taken inside, from nodes, cells and surfaces in memory to the solution.
 """
 
 from __future__ import annotations
