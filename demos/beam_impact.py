@@ -61,7 +61,7 @@ def solve(name: str, limit: float, panels: list[object]) -> tuple[dict[str, floa
             frames.pop(0)
             panel = panels.pop(0)
             peeq = law.cell_averages()["peeq"]
-            uem.plot_scene(problem, panel, field=peeq, label="equivalent plastic strain", levels=PEEQ, arrows=False,
+            uem.plot_scene(problem, panel, field=peeq, label="plastic strain", levels=PEEQ, arrows=False,
                            window=(-16, 16, -12, 42))  # fmt: skip
             if panel is not None:
                 panel.set_title(f"t = {step.time:.2f}")
@@ -91,7 +91,7 @@ def solve(name: str, limit: float, panels: list[object]) -> tuple[dict[str, floa
 PEEQ = list(np.linspace(0.0, 0.2, 11))
 if args.plot:
     frames_file = args.plot.replace(".png", "_frames.png")
-    with uem.figure(frames_file, comm, panels=4, size=(2.5, 4.4)) as panels:
+    with uem.figure(frames_file, comm, panels=4, columns=2, size=(4.4, 4.2)) as panels:
         plastic, plastic_history = solve("plastic", yield_stress, list(panels))
 else:
     plastic, plastic_history = solve("plastic", yield_stress, [])

@@ -22,8 +22,8 @@ import common
 DEMOS = Path(__file__).parents[1]
 #: Of a demo's page: the notebook and the script.
 DOWNLOADS = """<p>Download: <a href="{name}.ipynb" download>notebook</a>, <a href="{name}.py" download>script</a>.
-Both run in the folder <code>demos</code> of a clone, with <code>common.py</code>, which reads the options and writes the files. In a script of your
-own write numbers in place of <code>args</code>, and the path of the mesh in place of <code>common.MESHES</code>.</p>
+Both run in the folder <code>demos</code> of a clone, with <code>common.py</code>, which reads the options and writes the files.
+In a script of your own write numbers in place of <code>args</code>, and the path of the mesh in place of <code>common.MESHES</code>.</p>
 
 """
 
