@@ -5,6 +5,8 @@ The test to read first is ``test_a_bar_on_a_wall``: force, duration, momentum an
 
 from __future__ import annotations
 
+import sys
+
 from mpi4py import MPI
 
 import numpy as np
@@ -250,6 +252,24 @@ def test_a_step_assembles_nothing(monkeypatch):
         assert bar.contact.n_active == 2 or COMM.size > 1
         next(steps)
     assert not made
+
+
+def test_calls_of_a_step(monkeypatch):
+    """While a linear bar stays on the wall, a step makes no more than 3,000 calls, whatever its size."""
+    bar, calls = Flight(3, 10), []
+    bar.problem.rtol = 1e-8
+    steps = uem.time_steps(bar.problem, end=0.4)
+    while next(steps).time < 0.15:
+        pass
+    monkeypatch.setattr(uem.UnitedProblem, "attempt", ATTEMPT)
+    sys.setprofile(lambda frame, event, arg: calls.append(1) if event in ("call", "c_call") else None)
+    try:
+        for _ in range(5):
+            next(steps)
+    finally:
+        sys.setprofile(None)
+    # ranks exchange in more of them
+    assert len(calls) <= 5 * 3000 or COMM.size > 1
 
 
 @pytest.mark.parametrize("law", [uem.LinearElastic, uem.NeoHooke])

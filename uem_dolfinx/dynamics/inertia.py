@@ -330,12 +330,12 @@ class Dynamics(given.Sealed):
             forces[one.set.nodes] += one.nodal_forces(one.carried if carried else one.loads())
         return forces.ravel()
 
-    def _inertia(self) -> PETSc.Vec:
+    def _inertia(self, prescribed: tuple[Array, Array, Array] | None = None) -> PETSc.Vec:
         """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1."""
         s, n = self.scheme, self._n
         du = self._displacement - self._u
         a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
-        a[:n][self.held] = self._prescribed()[2]
+        a[:n][self.held] = (prescribed or self._prescribed())[2]
         inertia = self.mass.M * self._like(a[:n])
         if s.alpha_f:
             inertia.axpy(-s.alpha_f, self._like(self.forces.x.array[:n]))
@@ -363,10 +363,10 @@ class Dynamics(given.Sealed):
         self.forces.x.scatter_forward()
         self.accelerated = True
 
-    def rates(self) -> tuple[Array, Array]:
+    def rates(self, prescribed: tuple[Array, Array, Array] | None = None) -> tuple[Array, Array]:
         """Velocity and acceleration at the end of the present step, at the present displacement, ``(n,)`` each."""
         n, held, massy = self._n, self.held, self.massy.ravel()
-        end, mean, _ = self._prescribed()
+        end, mean, _ = prescribed or self._prescribed()
         du = (self._displacement - self._u)[:n]
         a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
         a[held], v[held] = mean, end
@@ -377,8 +377,8 @@ class Dynamics(given.Sealed):
         """Commit velocity and acceleration at the present displacement."""
         if self.moving:
             n, dt, held = self._n, self.dt, self.held
-            self.forces.x.array[:n] = self._inertia().array_r
-            self.velocity.x.array[:n], self.acceleration.x.array[:n] = self.rates()
+            self.forces.x.array[:n] = self._inertia(known := self._prescribed()).array_r
+            self.velocity.x.array[:n], self.acceleration.x.array[:n] = self.rates(known)
             self.mean_velocity.x.array[:n] = (self._displacement - self._u)[:n] / dt
             change = self.velocity.x.array[:n] - self._velocity[:n]
             work = (self.mass.M * self._like(change)).array_r * (self._velocity[:n] + 0.5 * change)

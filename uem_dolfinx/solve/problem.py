@@ -387,18 +387,18 @@ class UnitedProblem(given.Sealed):
         """Make the present state the committed one; the initial state of the step is unchanged (collective)."""
         if self.history is not None:
             self.history.note(self._before, self.led[2])
-        self.committed = np.array(self.u.x.array)
+        pairs, self.committed = self.interfaces, np.array(self.u.x.array)
         self.largest_forces = np.maximum(self.largest_forces, self.bodies.remembered(bool(self.pairs)))
         self.bodies.commit()
         if self.dynamics is not None:
             self.dynamics.commit()
             if self.linear is not None:
                 self.linear.settle(self.dynamics)
-        before = {id(pair): pair.committed for pair in self.interfaces}
-        for pair in self.interfaces:
+        before = {id(pair): pair.committed for pair in pairs}
+        for pair in pairs:
             pair.commit()
             pair.project()
-        self.motions = self.rigid_motions()
+        self.motions = [pair.target.motion for pair in pairs]
         self.watch.look(before, self.bodies.stiffness)
 
     def restore(self) -> None:
@@ -443,7 +443,7 @@ class UnitedProblem(given.Sealed):
     @property
     def interfaces(self) -> list[Interface]:
         """The interfaces in use, with similar contacts joined into one."""
-        return list({id(pair.whole): pair.whole for pair in self.pairs}.values())
+        return list({id(whole): whole for whole in [contact.pair.whole for contact in self.contacts]}.values())
 
     def rigid_motions(self) -> list[Motion | None]:
         """Present motions of the rigid targets of all ``interfaces``; None for targets that have not moved, and for meshes."""

@@ -194,7 +194,7 @@ class ExplicitStepper:
             EnergyGivenError: if this exceeds the limit, and a shorter step may be better.
         """
         problem, control, given = self.problem, self.problem.step_control, 0.0
-        for pair in problem.interfaces:
+        for pair in problem.system.pairs:
             opened = pair.committed.active & ~pair.trial.active
             given += 0.5 * float((pair.committed.lam * np.maximum(pair.gap, 0.0))[opened].sum()) if opened.any() else 0.0
         words = control.too_much(reduced(problem.comm, given), dt, self.dynamics.kinetic_energy)
