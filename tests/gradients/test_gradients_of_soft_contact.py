@@ -5,6 +5,8 @@ Read first: ``test_of_second_order``, Taylor's test for every law and coupling.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -156,6 +158,35 @@ def test_the_same_on_any_ranks():
         s = pressed("triangle", comm=comm, normal=LAWS["power"])
         found.append([float(by) for by in uem.gradient(s.solve(), s.J, [s.E, *s.soft.constants])])
     assert found[0] == pytest.approx(found[1], rel=1e-9)
+
+
+def pushed(bulge):
+    """A block with a bulging face pressed onto a wider one by a general contact: Constants, a functional, and ``solve``."""
+    b = blocks(
+        COMM, "triangle", 4, 7, overhang=0.25, gap=0.01,
+        pose=lambda x: x + np.where(x[:, 1:] > 5e-3, bulge * (x[:, :1] - 0.5) ** 2, 0.0) * [0.0, 1.0],
+    )  # fmt: skip
+    E, p0, h = numbers(b.scene.mesh, 1.0, 1e-2, 5e-3)
+    soft, F = uem.SoftContact(uem.PowerLaw(p0, h, 2.0)), linear(b.u, E)
+    bcs = [*clamp(b.V, b.bottom), uem.dirichlet(b.V, b.top, value=[0.0, -0.02])]
+
+    def solve():
+        b.u.x.array[:] = 0.0
+        problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[uem.GeneralContact(normal=soft)], rtol=1e-13)
+        for _ in uem.load_steps(problem, 1):
+            pass
+        return problem
+
+    return SimpleNamespace(E=E, soft=soft, J=ufl.inner(b.u, b.u) * ufl.dx + b.u[0] * ufl.dx, solve=solve)
+
+
+def test_general_contact():
+    """Away from sharp edges, whose areas turn with the normals of the other body: there it is refused."""
+    s = pushed(0.5)
+    assert min(order_by(s, m, s.J) for m in (s.E, s.soft.constants[0])) >= 1.95
+    s = pushed(0.0)
+    problem = s.solve()
+    refused(uem.errors.InputError, "sharp edges of the contactor press", lambda: uem.gradient(problem, s.J, s.E))
 
 
 def test_what_is_refused():

@@ -54,6 +54,7 @@ from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, va
 from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of, rubbed, thickened, turned_by
 from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
+from uem_dolfinx.gradients.refused import refuse_sharp
 from uem_dolfinx.gradients.shape_slopes import ShapeSlopes, shape_slopes_of
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import gathered, reduced
@@ -152,6 +153,8 @@ class Linearised:
         state = system.assemble_constraints(lambda norm, scale, rounding: True)
         assert isinstance(state, BodyState)
         self.P, self.rows, self.equations = state.trial, state.rows, state.rows.of(self.problem.pairs)
+        for contact in self.problem.contacts:
+            refuse_sharp(contact)
         self.multipliers = state.test.multipliers(state.test.pass_on(system.residual()))
         return state
 

@@ -7,6 +7,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.gradients.parameters import ContactParameter
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -61,6 +62,18 @@ def refuse_soft(contact: Contact) -> None:
     ):
         if there:
             raise InputError(f"contact '{contact.name}': gradients do not support soft contact with {what}: expected {expected}")
+
+
+def refuse_sharp(contact: Contact) -> None:
+    """Refuse a soft contact by nodes that presses at sharp edges, where areas turn with the target's normal (collective)."""
+    if contact.normal is None or contact.coupling == "mortar":
+        return
+    pressing = (contact.pair.trial.lam > 0.0) & contact.surface.at_sharp_edges(contact.nodes)
+    if reduced(contact.config.comm, int(pressing.sum())):
+        raise InputError(
+            f"contact '{contact.name}': nodes at sharp edges of the contactor press, and areas of soft contact there have no derivatives: "
+            "leave the facets next to the edge out of the contactor, or take coupling='mortar' and sliding='small'"
+        )
 
 
 def refuse_shape(problem: UnitedProblem) -> None:
