@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem, mesh
-from helpers import at, blocks, box, clamp, linear, modulus, refused, run, scene
+from helpers import Body, at, blocks, box, clamp, linear, modulus, refused, run, scene
 from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
@@ -149,3 +149,66 @@ def test_refused(monkeypatch):
         refused(error, words, call)
     monkeypatch.setitem(sys.modules, "slepc4py", None)
     refused(uem.MissingBackendError, "install python3-slepc4py-real", lambda: uem.modes(problem, mass=mass))
+
+
+def of_ring(part, where=None):
+    """All, or a quarter, of a ring in 12 or 3 cells around, of which a part may be shrunk onto a rigid disc, and its mass."""
+    n, turned = 3 * part, 0.5 * np.pi * part
+    body = box("quadrilateral", [1.0, 0.0], [1.3, turned], [2, n])
+    if part == 4:
+        # the last nodes are the first ones again
+        number = np.arange(len(body.x))
+        number[number % (n + 1) == n] -= n
+        used, cells = np.unique(number[body.cells], return_inverse=True)
+        body = Body(body.x[used], cells.reshape(body.cells.shape))
+    s = scene(COMM, "quadrilateral", [body], pose=lambda x: x[:, :1] * np.column_stack([np.cos(x[:, 1]), np.sin(x[:, 1])]))
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    # stiffer where each sector has its first cells
+    x = ufl.SpatialCoordinate(s.mesh)
+    stiff = E * (1.0 + 0.5 * (x[0] ** 2 - x[1] ** 2) ** 2 / ufl.dot(x, x) ** 2)
+    F, equations = uem.LinearElastic(stiff, 0.3, kind="plane_strain").residual(u, v) * ufl.dx, []
+    if part == 1:
+        equations = [
+            uem.periodic(s.tag("second", 0, at(1, turned)), s.tag("first", 0, at(1, 0.0)), turn=[[0.0, -1.0], [1.0, 0.0]])
+        ]
+    disc = uem.RigidSphere((0.0, 0.0), 1.01)
+    contacts = [] if where is None else [uem.Contact(s.tag("inner", 0, where), disc)]
+    problem = uem.UnitedProblem(F, u, equations=equations, contacts=contacts)
+    return problem, uem.consistent_mass(V, RHO)
+
+
+def middles(x):
+    """The inner side of the second cell of each quarter."""
+    angle = np.mod(x[:, 1], 0.5 * np.pi) * 6 / np.pi
+    return np.isclose(x[:, 0], 1.0) & (angle > 0.9) & (angle < 2.1)
+
+
+@pytest.mark.parametrize("where", [None, middles])
+def test_nodal_diameters_are_the_modes_of_the_ring(where):
+    """Frequencies of the whole ring, with contact too, are those of its sector for 0, 1 and 2 diameters, of which 1 has each twice."""
+    problem, mass = of_ring(4, where)
+    if where is not None:
+        run(problem)
+        assert problem.contacts[0].n_active == 8
+    whole = uem.modes(problem, 16, mass=mass)
+    sector, own = of_ring(1, where)
+    if where is not None:
+        run(sector)
+    found = {k: uem.modes(sector, 8, mass=own, diameter=k) for k in (0, 1, 2)}
+    pairs = found[1].eigenvalues
+    size = whole.eigenvalues[-1]
+    assert pairs[::2] == pytest.approx(pairs[1::2], abs=1e-8 * size)
+    each = np.sort(np.concatenate([one.eigenvalues for one in found.values()]))
+    assert each[:16] == pytest.approx(whole.eigenvalues, abs=1e-8 * size)
+
+
+def test_what_has_no_nodal_diameters():
+    """Rings without a cut, more diameters than half of the sectors, and contacts at the cut."""
+    (problem, mass), (sector, own) = of_ring(4), of_ring(1)
+    refused(uem.InputError, "expected 0 to 2", lambda: uem.modes(sector, 2, mass=own, diameter=3))
+    refused(uem.InputError, "a sector of a ring", lambda: uem.modes(problem, 2, mass=mass, diameter=1))
+    refused(uem.InputError, "diameter = -1", lambda: uem.modes(sector, 2, mass=own, diameter=-1))
+    pressed, own = of_ring(1, at(0, 1.0))
+    run(pressed)
+    refused(uem.InputError, "contacts act at nodes of the cut", lambda: uem.modes(pressed, 2, mass=own, diameter=1))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import given
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.conditions.places import COINCIDENT, NEAR, described, global_nodes, middle_of, nodes_at, partners
 from uem_dolfinx.errors import InputError, InputTypeError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -153,8 +153,13 @@ class Periodic(given.Sealed):
         self._follower, self._leader = follower, leader
         self.places = [follower, leader]
         self._map = given.kind("map", map, map is None or callable(map), "a function of places (n, gdim), or None")
-        self._turn = None if turn is None else _rotation(turn)
+        #: Rotation of the components, or None.
+        self.turn = None if turn is None else _rotation(turn)
         self.b = checked_value("jump", jump, None)
+
+    def followers(self, config: Configuration) -> Indices:
+        """Owned nodes that follow (collective)."""
+        return nodes_at(config, self._follower, "the follower of a periodic surface")
 
     def n_values(self, block: int) -> int:
         """See ``LinearEquations``."""
@@ -162,7 +167,7 @@ class Periodic(given.Sealed):
 
     def rows(self, config: Configuration, role: str) -> GivenRows:
         """See ``LinearEquations``."""
-        g, turn = config.block, self._turn
+        g, turn = config.block, self.turn
         with agreed(config.comm):
             if turn is not None and len(turn) != config.gdim:
                 raise InputError(f"{role}: turn has the shape {turn.shape}: expected ({config.gdim}, {config.gdim})")
@@ -196,7 +201,7 @@ class Periodic(given.Sealed):
         c[:, :, 0], c[:, :, 1] = np.eye(g), -R
         node = np.broadcast_to(node[:, None], (n, g, 2))
         value = np.broadcast_to(np.arange(g), (n, g))
-        if self._turn is None:
+        if self.turn is None:
             # without a rotation the equations of such a node are trivial
             c, node, value = c[distinct], node[distinct], value[distinct]
         return _of_terms(value.ravel(), node.reshape(-1, 2), c.reshape(-1, 2, g))
@@ -212,7 +217,7 @@ class Periodic(given.Sealed):
                         f"the map of {role} returned an array of shape {images.shape}: expected finite ones of {x.shape}"
                     )
             return images
-        return x @ self._turn if self._turn is not None else x + shift
+        return x @ self.turn if self.turn is not None else x + shift
 
     def _check_sizes(self, config: Configuration, n_follower: int, n_leader: int, role: str) -> None:
         n = gathered(config.comm, np.array([n_follower, n_leader])).sum(axis=0)

@@ -47,7 +47,7 @@ from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.geometry.search import ON_SIDE
+from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.contact_fields import along_field
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
@@ -196,8 +196,9 @@ class Linearised:
         for contact, pair in zip(self.problem.contacts, self.problem.pairs):
             p, place = getattr(pair.kinematics, "projection", None), np.full(3, np.nan)
             on = np.zeros(len(pair.nodes), dtype=bool)
-            if isinstance(p, FacetProjection) and contact.coupling == "node_to_surface" and not contact.tied:
-                on = pair.trial.active & (pair.target.shape.side_distances(p.xi) < ON_SIDE).any(axis=1)
+            target, free = pair.target, contact.coupling == "node_to_surface" and not contact.tied
+            if free and isinstance(p, FacetProjection) and isinstance(target, MeshTarget):
+                on = pair.trial.active & (target.shape.side_distances(p.xi) < ON_SIDE).any(axis=1)
                 place[: self.config.gdim] = self.config.X[pair.nodes[on][0]] if on.any() else np.nan
             if count := reduced(self.config.comm, int(on.sum())):
                 places = gathered(self.config.comm, place)[:, : self.config.gdim]

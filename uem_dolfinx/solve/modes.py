@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dolfinx import fem
@@ -13,7 +14,8 @@ from petsc4py import PETSc
 from uem_dolfinx import given
 from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.conditions.equation import Periodic
 from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError, SpaceError
@@ -22,8 +24,11 @@ from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.bodies.tangent import added_mass, contact_curvature, curvature_of, slip_terms, together
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.united.rows import make_rows
+from uem_dolfinx.solve.united.rows import Rows, make_rows
 from uem_dolfinx.solve.united.system import BodySystem
+
+if TYPE_CHECKING:
+    from uem_dolfinx.algebra.harmonic import Harmonic
 
 #: Relative error of the eigenvalues.
 #: [bound; the eigenvalue; -]
@@ -45,7 +50,7 @@ class Vibrations:
     functions: list[fem.Function]
 
 
-def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vibrations:
+def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None, diameter: int | None = None) -> Vibrations:
     """The lowest natural frequencies of small vibrations about the present equilibrium, with the present contact (collective).
 
     Active contactors follow their targets: sticking ones in all directions, slipping ones along the normal only, without friction. Other
@@ -58,6 +63,9 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
         problem: in equilibrium.
         n: number of modes.
         mass: of the bodies, in addition to masses at points of rigid couplings; None takes the mass of the problem's dynamics.
+        diameter: for a sector of a ring, held by ``uem.periodic(cut, other, turn=R)``: the number of nodal diameters of the modes, from 0
+            to half the number of sectors. Modes of the whole ring are those of all of them; between the ends each frequency is there
+            twice. Functions are those of this sector. Contacts may act apart from the cut that follows. None as 0.
 
     Raises:
         MissingBackendError: without slepc4py.
@@ -69,6 +77,7 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
     config, bodies, system = problem.config, problem.bodies, problem.system
     with agreed(problem.comm):
         n = given.count("n", n)
+        diameter = given.count("diameter", diameter) if diameter else None
         if not config.moves:
             refuse_other_fields(config, "natural frequencies", "take eigenvalues of your own")
         if mass is None and problem.dynamics is None:
@@ -83,7 +92,7 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
             )
         if not isinstance(system, BodySystem):
             raise InputError("modes need contact by elimination: the default method")
-    given.alike(problem.comm, "modes", n=n)
+    given.alike(problem.comm, "modes", n=n, diameter=diameter)
     slepc = _slepc()
     with nullcontext() if problem.dynamics is None else problem.dynamics.without_inertia():
         bodies.assemble()
@@ -101,8 +110,56 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None) -> Vi
             springs = [] if system.linear is None else system.linear.stiffness()
             gaps = together(gaps, contact_curvature(springs, like) if springs else None)
             stiffness = together(bodies.tangent.K, together(curvature, gaps))
-            A, B = _united(P, stiffness), _united(P, together(M, added))
-    return _solve(slepc, problem, P, A, B, n)
+            if diameter:
+                harmonic = _harmonic(problem, rows, diameter)
+                A, block = harmonic.united(stiffness)
+                B, _ = harmonic.united(together(M, added))
+                used, expand = harmonic.used, harmonic.expand
+            else:
+                A, B = _united(P, stiffness), _united(P, together(M, added))
+                block, used, expand = A, P.used.ravel(), lambda q: P.expand(P.space.vector(q))
+    diagonal = block.getDiagonal()
+    # idle components
+    diagonal.array[~P.used.ravel()] = diagonal.max()[1]
+    block.setDiagonal(diagonal)
+    if not is_symmetric(block, config.unknowns):
+        raise InputError(
+            "modes need a symmetric tangent, and that of this problem is not, as with a temperature that strains bodies: leave such fields "
+            "to a problem of their own"
+        )
+    return _solve(slepc, problem, used, expand, A, B, n)
+
+
+def _harmonic(problem: UnitedProblem, rows: Rows, diameter: int) -> Harmonic:
+    """A nodal diameter of a sector with these equations (collective).
+
+    Raises:
+        InputError: if the equations are not those of a sector, if contacts act at the cut that follows, or if the ring has no such nodal
+            diameter.
+    """
+    from uem_dolfinx.algebra.harmonic import Harmonic
+
+    config, P = problem.config, rows.frictionless
+    with agreed(problem.comm):
+        turned = [one for one in problem.equations if isinstance(one, Periodic) and one.turn is not None]
+        if len(turned) != 1 or len(problem.equations) != 1 or problem.couplings:
+            raise InputError(
+                "diameter is for a sector of a ring: expected the equation uem.periodic(cut, other cut, turn=R) alone, and no couplings"
+            )
+        angle = np.arccos(np.clip(0.5 * (np.trace(turned[0].turn) - (config.gdim - 2)), -1.0, 1.0))  # type: ignore[arg-type]
+        n = round(2.0 * np.pi / angle) if angle > 0.0 else 0
+        if diameter > n // 2:
+            raise InputError(f"diameter = {diameter}: expected 0 to {n // 2}, the nodal diameters of a ring of {n} sectors")
+    follower, own = turned[0].followers(config), np.zeros(config.n_owned, dtype=bool)
+    own[follower[follower < config.n_owned]] = True
+    there = config.ask_owners(rows.whole.P.followed, own[:, None].astype(float)).ravel() > 0.0
+    of_contacts = sum(len(equations) for equations in rows.equations)
+    touched = own[rows.whole.P.node[:of_contacts]].any() or there[rows.whole.P.row < of_contacts].any()
+    if reduced(problem.comm, int(touched or P.used[: config.n_owned][own].any())):
+        raise InputError(
+            "contacts act at nodes of the cut that follows, or nodes of it lie on the axis: nodal diameters need a cut apart from both"
+        )
+    return Harmonic(P, own, diameter, n)
 
 
 def _slepc() -> Any:
@@ -124,9 +181,21 @@ def _united(P: Restriction, A: PETSc.Mat) -> PETSc.Mat:
     return A
 
 
-def _solve(slepc: Any, problem: UnitedProblem, P: Restriction, A: PETSc.Mat, B: PETSc.Mat, n: int) -> Vibrations:
-    """Eigenvectors of lowest eigenvalues, as displacements (collective)."""
-    comm, used = P.comm, P.used.ravel()
+def _solve(
+    slepc: Any, problem: UnitedProblem, used: Bools, expand: Callable[[Array], PETSc.Vec], A: PETSc.Mat, B: PETSc.Mat, n: int
+) -> Vibrations:
+    """Eigenvectors of lowest eigenvalues, as displacements (collective).
+
+    Args:
+        slepc: the module.
+        problem: of the displacements.
+        used: unknowns in use.
+        expand: returns the displacement of owned unknowns.
+        A: stiffness.
+        B: mass.
+        n: number of eigenvectors.
+    """
+    comm, V = problem.comm, problem.u.function_space
     stiffness, inertia = A.getDiagonal(), B.getDiagonal()
     moving = int(reduced(comm, int((used & (inertia.array_r > 0.0)).sum())))
     if moving < n:
@@ -136,11 +205,6 @@ def _solve(slepc: Any, problem: UnitedProblem, P: Restriction, A: PETSc.Mat, B: 
     # idle components get infinite frequencies
     stiffness.array[~used] = stiffness.max()[1]
     A.setDiagonal(stiffness)
-    if not is_symmetric(A, problem.config.unknowns):
-        raise InputError(
-            "modes need a symmetric tangent, and that of this problem is not, as with a temperature that strains bodies: leave such fields "
-            "to a problem of their own"
-        )
     eps = slepc.EPS().create(comm)
     eps.setOperators(A, B)
     eps.setProblemType(slepc.EPS.ProblemType.GHEP)
@@ -166,13 +230,13 @@ def _solve(slepc: Any, problem: UnitedProblem, P: Restriction, A: PETSc.Mat, B: 
     for i in range(n):
         q = A.createVecRight()
         value = eps.getEigenpair(i, q).real
-        found.append((value, P.expand(P.space.vector(q.array_r))))
+        found.append((value, expand(q.array_r)))
     found.sort(key=lambda pair: pair[0])
     values = np.array([value for value, _ in found])
     eps.destroy()
     functions = []
     for i, (_, v) in enumerate(found):
-        function, own = fem.Function(P.space.V, name=f"mode_{i + 1}"), problem.config.from_rows(v.array_r)
+        function, own = fem.Function(V, name=f"mode_{i + 1}"), problem.config.from_rows(v.array_r)
         function.x.array[: len(own)] = own
         function.x.scatter_forward()
         functions.append(function)
