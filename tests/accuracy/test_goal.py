@@ -67,6 +67,23 @@ def punch(size=None, degree=1, h=0.5):
     return problem, {"force": force(F, tags["bottom"]), "displacement": ufl.SpatialCoordinate(mesh)[0] * u[0] * ufl.dx}
 
 
+def stacked(dim, n_1, n_2, degree, tied, coupling="mortar", quads=0):
+    """A unit block and one of half its width on it, tied or not; in 2D a tied one is pushed to the side as well."""
+    parameters = {"dim": dim, "n_1": n_1, "n_2": n_2, "quads": quads}
+    mesh, tags = uem.read_gmsh(uem.example_mesh("blocks"), COMM, gdim=dim, parameters=parameters)
+    upper = np.unique(compat.geometry_dofs(mesh)[tags["block_2"].entities])
+    mesh.geometry.x[upper, : dim - 1] *= 0.5
+    V = uem.function_space(mesh, degree, (dim,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(100.0, 0.3, kind="3d" if dim == 3 else "plane_strain").residual(u, v) * ufl.dx
+    pushed = (0.01 * (tied and dim == 2), *(0.0,) * (dim - 2), -0.02)
+    bcs = [uem.dirichlet(V, tags["bottom_1"]), uem.dirichlet(V, tags["top_2"], value=pushed)]
+    contact = uem.Contact(tags["bottom_2"], tags["top_1"], tied=tied, coupling=coupling)
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    problem.solve()
+    return problem, {"force": force(F, tags["bottom_1"], dim - 1), "mean": u[dim - 1] * uem.dx(tags["block_1"])}
+
+
 def value(J):
     return COMM.allreduce(fem.assemble_scalar(forms.form(J)))
 
@@ -100,6 +117,36 @@ def test_effectivity(scene, n, degree, coupling, finer):
         assert np.isclose(found.value, value(J), rtol=1e-12)
         ratio = found.error / (exact(scene)[name] - found.value)
         assert 0.5 < ratio < 1.5, (name, ratio)
+
+
+@cache
+def stacked_exact(dim, tied):
+    """Goals in the limit of two meshes, where errors fall like h at sharp corners."""
+    coarse, fine = (
+        {k: value(J) for k, J in stacked(dim, n, n, 2, tied, quads=1)[1].items()} for n in ((4, 8), (16, 32))[dim == 2]
+    )
+    return {k: 2 * v - coarse[k] for k, v in fine.items()}
+
+
+@pytest.mark.parametrize(
+    "dim, n_1, n_2, degree, tied, coupling, quads",
+    [
+        (2, 4, 6, 1, True, "mortar", 0),
+        slow(2, 8, 4, 2, True, "mortar", 1),
+        slow(3, 3, 3, 1, False, "node_to_surface", 0),
+        slow(3, 3, 4, 1, False, "mortar", 1),
+        slow(3, 2, 3, 2, False, "mortar", 0),
+        slow(3, 2, 2, 2, False, "node_to_surface", 1),
+        slow(3, 4, 2, 1, True, "mortar", 0),
+        slow(3, 2, 2, 2, True, "mortar", 0),
+    ],
+)
+def test_ties_and_space(dim, n_1, n_2, degree, tied, coupling, quads):
+    """The same for ties, and in 3D with tetrahedra and hexahedra."""
+    problem, goals = stacked(dim, n_1, n_2, degree, tied, coupling, quads)
+    for name, J in goals.items():
+        found = uem.goal_error(problem, J)
+        assert 0.5 < found.error / (stacked_exact(dim, tied)[name] - found.value) < 1.5, name
 
 
 @pytest.mark.parametrize("degree, coupling", [(1, "node_to_surface"), (2, "mortar")])
