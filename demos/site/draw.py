@@ -1,4 +1,4 @@
-"""Pictures of the how-to pages that no demo makes: scripts of the pages run as they stand there, and their results are drawn.
+"""Pictures of the pages that no demo makes: scripts of how-to pages run as they stand there, and their results are drawn.
 
 .ci/with python demos/site/draw.py FOLDER [PAGE...]        writes FOLDER/page_NAME.png
 """
@@ -174,9 +174,35 @@ def cluster(path: Path) -> None:
         panel.set(xlabel="time in s; stages are nested", xlim=(0, 1.35 * float(seconds[0])))
 
 
+def elimination(path: Path) -> None:
+    """A contactor above a facet of the target: closest point, normal, gap, and nodes of the facet with their shape functions."""
+    target = np.array([(-1.2, -0.15), (0.0, 0.0), (2.0, 0.2), (3.2, -0.05)])
+    body = np.array([(-0.6, 1.15), (1.1, 0.75), (2.7, 1.0)])
+    along = (target[2] - target[1]) / np.linalg.norm(target[2] - target[1])
+    n, x = np.array([-along[1], along[0]]), body[1]
+    y = target[1] + along * ((x - target[1]) @ along)
+    with uem.figure(path, COMM, size=(6.4, 3.2)) as (panel,):
+        panel.fill_between(*target.T, -0.9, color="0.88")
+        panel.fill_between(*body.T, 1.9, color="0.94")
+        panel.plot(*target.T, "o-", color="C0", lw=2)
+        panel.plot(*body.T, "o-", color="C3", lw=2)
+        panel.plot(*np.transpose([x, y]), "k--", lw=1)
+        panel.plot(*y, "ks", ms=5)
+        panel.annotate("", y + 0.5 * n - 0.45 * along, y - 0.45 * along, arrowprops={"arrowstyle": "->", "lw": 1.5})
+        for text, place in (
+            ("contactor $x_i$", x + (-0.4, 0.22)), ("gap $g_i$", 0.5 * (x + y) + (0.1, 0)),
+            ("closest point $y = N_1 x_1 + N_2 x_2$", y + (-0.7, -0.6)),
+            ("$x_1$", target[1] + (-0.05, -0.28)), ("$x_2$", target[2] + (-0.05, -0.28)), ("$n$", y + 0.5 * n - (0.68, 0.05)),
+            ("target", (-1.1, -0.7)), ("body of the contactor", (-0.4, 1.6)),
+        ):  # fmt: skip
+            panel.text(*place, text)
+        panel.set(xlim=(-1.2, 3.2), ylim=(-0.9, 1.9), aspect="equal")
+        panel.set_axis_off()
+
+
 if __name__ == "__main__":
     drawn: dict[str, Callable[[Path], None]] = {
-        one.__name__: one for one in (cyclic, staggered, meshes, solvers, restart, errors, cluster)
+        one.__name__: one for one in (cyclic, staggered, meshes, solvers, restart, errors, cluster, elimination)
     }
     for name in sys.argv[2:] or drawn:
         drawn[name](FOLDER / f"page_{name}.png")
