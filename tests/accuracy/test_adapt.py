@@ -55,6 +55,13 @@ def test_sizes_for_a_tolerance(degree, quads):
     assert 0.4 * tolerance < found.estimate.relative <= tolerance
 
 
+def test_fewer_cells_than_at_first():
+    """Of a fine uniform mesh most cells are merged, with a smaller error than before: fine cells far from the corner serve nothing."""
+    found = uem.adapt(lambda size: punch(size, h=0.1), tolerance=0.035)
+    first, last = found.meshes[0], found.meshes[-1]
+    assert found.reached and last.cells < 0.1 * first.cells and last.estimate < first.estimate
+
+
 def test_a_number_of_cells():
     """The number is met, with a smaller error than that of as many equal cells."""
     found = uem.adapt(punch, cells=600)
