@@ -406,3 +406,18 @@ def test_dissipation_refuses_other_laws():
         problem = pulled(b, lambda s: 0.0 * direction(2, 0.0), [contact])
         refused(uem.InputError, words, lambda problem=problem: next(uem.load_steps(problem, 2, arc_length=uem.Dissipation(1.0))))
     refused(uem.InputError, "energy", lambda: uem.Dissipation(0.0))
+    b = blocks(COMM, "quadrilateral", 2, 3)
+    law, v = uem.VonMises(b.u, 1.0, 0.3, 0.1, kind="plane_strain"), ufl.TestFunction(b.V)
+    P, contact = fem.Constant(b.scene.mesh, 0.0), uem.Contact(b.high, b.low, cohesion=uem.Cohesive(1.0, 0.01), sliding="small")
+    F = law.residual(v) - P * v[1] * uem.ds(b.top, b.scene.mesh)
+    bcs = uem.dirichlet(b.V, b.bottom)
+    problem = uem.UnitedProblem(F, b.u, bcs=[bcs], contacts=[contact], materials=[law], load={P: 0.1})
+    refused(uem.InputError, "VonMises", lambda: next(uem.load_steps(problem, 2, arc_length=uem.Dissipation(1.0))))
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_an_energy_of_several_contactors(coupling):
+    """A step that is to separate the whole bond several times over ends in an error that names the energy of a contactor."""
+    problem = cracking(COMM, coupling=coupling).problem
+    with pytest.raises(uem.ConvergenceError, match=r"Dissipation\(0.3\) separates several .* each takes at most 0.0125"):
+        list(uem.load_steps(problem, 1, arc_length=uem.Dissipation(0.3)))

@@ -74,6 +74,11 @@ class SofteningInterface(Interface):
         """Whether damage has grown in the last step, and whether some of it can grow on, at this rank's contactors."""
         return False, False
 
+    @property
+    def largest_energy(self) -> float:
+        """Largest energy that a contactor of this rank takes to separate."""
+        return 0.0
+
 
 def growth_of(state: Array) -> tuple[bool, bool]:
     """Whether damage has grown in the last step, and whether at bonds that have not separated; ``state (n, columns)`` of the bonds."""
@@ -160,6 +165,12 @@ class CohesiveInterface(SofteningInterface):
         """See ``SofteningInterface``."""
         state = self.committed.cohesion
         return (False, False) if state is None else growth_of(state)
+
+    @property
+    def largest_energy(self) -> float:
+        """See ``SofteningInterface``."""
+        areas = self._bonds.bonded_areas(self._contact._areas)
+        return float(max(self._law.energy, self._law.shear_energy) * areas.max(initial=0.0))
 
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """Terms of friction, and the stiffness of the bonds; see ``Interface``."""

@@ -9,8 +9,11 @@ measured in the displacement only: other fields, with other units, have no part 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+
+from mpi4py import MPI
 
 import numpy as np
 from petsc4py import PETSc
@@ -24,7 +27,7 @@ from uem_dolfinx.log import say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps.dissipation import Dissipation, refuse_other_laws
+from uem_dolfinx.solve.steps.dissipation import Dissipation, advise, refuse_other_laws
 from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, Iteration, IterationState, LinearisedProblem
 from uem_dolfinx.solve.united.rows import BodyState
 from uem_dolfinx.solve.united.system import BodySystem
@@ -189,7 +192,7 @@ class AlongArc:
         if not problem.config.moves:
             refuse_other_fields(problem.config, "steps by arc length", "leave arc_length out")
         if by is not None:
-            refuse_other_laws(problem.contacts)
+            refuse_other_laws(problem.contacts, problem.materials)
         self._problem, self._arc, self._by = problem, ArcLength(problem), by
         self.tried, self.most, self.longer, self.loops = 0.0, MOST_STEPS, True, 1
 
@@ -216,7 +219,7 @@ class AlongArc:
             with ExitStack() as path:
                 for pair in bonds:
                     path.enter_context(pair.along_path())
-                iterations = problem.attempt(along=self._arc)
+                iterations = self._attempt(bonds)
             factor = self._arc.factor
             spent = self._arc.dissipated(self._way(np.array(problem.u.x.array) - before), factor - done)
             dissipating = float(np.clip(spent / energy, 0.0, 1.0))
@@ -239,6 +242,16 @@ class AlongArc:
                 progress.start = np.array(problem.committed)
         progress.dissipating = dissipating
         return factor, iterations
+
+    def _attempt(self, bonds: Sequence[SofteningInterface]) -> list[Iteration]:
+        """Equilibrium along the arc; an error names an energy that is too large (collective)."""
+        try:
+            return self._problem.attempt(along=self._arc)
+        except ConvergenceError as error:
+            if self._by is not None:
+                each = max((pair.largest_energy for pair in bonds), default=0.0)
+                advise(error, self._by.energy, float(reduced(self._problem.comm, each, op=MPI.MAX)))
+            raise
 
     def _by_load(self, factor: float) -> list[Iteration]:
         """Equilibrium under a given load."""

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from uem_dolfinx import given
-from uem_dolfinx.errors import InputError
+from uem_dolfinx.errors import ConvergenceError, InputError
 
 
 class Dissipation(given.Sealed):
@@ -37,12 +37,25 @@ class Dissipation(given.Sealed):
         return f"Dissipation({self.energy:g})"
 
 
-def refuse_other_laws(contacts: Sequence[Any]) -> None:
-    """Refuse laws of cohesion whose dissipation is not measured by load and displacement alone.
+def advise(error: ConvergenceError, energy: float, largest: float) -> None:
+    """Name an ``energy`` of a step above the ``largest`` that a contactor takes to separate: the path may turn within such a step."""
+    if energy > largest:
+        error.amend(
+            f"Dissipation({energy:g}) separates several contactors in a step, as each takes at most {largest:.3g}: take a smaller energy"
+        )
+
+
+def refuse_other_laws(contacts: Sequence[Any], materials: Sequence[Any]) -> None:
+    """Refuse laws whose dissipation is not measured by load and displacement alone.
 
     Raises:
-        InputError: for plastic unloading, and for a viscosity, which is a part of the load factor.
+        InputError: for materials with history, for plastic unloading, and for a viscosity, which is a part of the load factor.
     """
+    for material in materials:
+        raise InputError(
+            f"{type(material).__name__} does not go with arc_length = Dissipation(...), as load and displacement do not tell what it "
+            "dissipates: take arc_length=True"
+        )
     for contact in contacts:
         law = contact.cohesion
         for what, there in (
