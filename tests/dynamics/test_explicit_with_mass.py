@@ -220,3 +220,19 @@ def test_velocities_at_rest(lower):
     assert fastest < 1e-2 * 0.5 * step.dt * g
     weight = g * len(boxes)
     assert abs(contacts[0].resultant().force[1] / weight - 1.0) < 1e-3
+
+
+def test_a_run_that_is_continued_is_the_same(tmp_path):
+    """Two bars in contact, continued from a checkpoint of another run: the same steps, displacement and velocity to rounding."""
+    path = COMM.bcast(str(tmp_path / "kept"))
+    (whole, _, _), (first, _, _), (again, _, _) = (bars(cells=12, lower=True) for _ in range(3))
+    lengths = [step.dt for step in uem.time_steps(whole, end=0.5)]
+    steps = uem.time_steps(first, end=0.5, checkpoint=uem.Checkpoint(path, every=5))
+    while next(steps).number < 12:
+        pass
+    steps.close()
+    later = [step.dt for step in uem.time_steps(again, end=0.5, checkpoint=uem.Checkpoint(path, every=5))]
+    assert 0 < len(later) < len(lengths) and later == lengths[-len(later) :]
+    # of displacements and velocities of size 1
+    assert np.allclose(again.u.x.array, whole.u.x.array, rtol=0, atol=1e-14)
+    assert np.allclose(again.dynamics.velocity.x.array, whole.dynamics.velocity.x.array, rtol=0, atol=1e-12)
