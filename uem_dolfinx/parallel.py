@@ -201,6 +201,8 @@ class Exchange:
             comm: communicator.
             rank: receiving rank of each row ``(n,)``, -1 for no rank.
         """
+        if comm.size == 1:
+            return cls(comm, [np.flatnonzero(rank >= 0)])
         order = np.argsort(rank, kind="stable")
         ends = np.searchsorted(rank[order], np.arange(comm.size + 1))
         return cls(comm, [order[a:b] for a, b in pairwise(ends)])

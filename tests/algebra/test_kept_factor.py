@@ -55,8 +55,26 @@ def test_linear_bodies_with_a_large_contact_zone(dim, monkeypatch):
     assert np.array_equal(s.gather(contact.active), t.gather(other.active))
 
 
+def test_linear_bodies_are_factorised_once_a_run(monkeypatch):
+    """The factorisation of the first step preconditions the solves of later ones, which end as by a new one."""
+    monkeypatch.setattr(Condensed, "_is_cheaper", lambda *_: False)
+    made, set_up, found = [], UnitedSolver._set_up, []
+    monkeypatch.setattr(UnitedSolver, "_set_up", lambda self, **options: made.append(set_up(self, **options)))
+    for anew in (False, True):
+        s, contact, problem = pressed(way=0.005)
+        problem.solve()
+        if anew:
+            problem.system.forget()
+        before = len(made)
+        assert len(problem.solve(start=np.zeros_like(problem.u.x.array), fraction=0.98)) > 2
+        found.append((len(made) - before, s.gather(problem.u), contact.n_active))
+    (none, u, active), (one, v, same) = found
+    assert (none, one) == (0, 1) and active == same > 2
+    assert np.abs(u - v).max() <= 1e-8 * np.abs(v).max()
+
+
 def test_every_step_factorises_once():
-    """No step depends on the ones before it."""
+    """Where bodies are strained, no step depends on the ones before it."""
     _, _, problem = pressed(st_venant, way=0.002)
     problem.solve()
     with counted() as calls:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any
 
 from mpi4py import MPI
@@ -69,9 +69,13 @@ class UnitingEquations:
                 np.zeros(0, np.int32), np.zeros((0, block)), np.zeros((0, 0), np.int64), np.zeros((0, 0)), np.zeros(0),
                 np.zeros(0, bool),
             )  # fmt: skip
-        first = np.cumsum([0, *(len(p) for p in parts)])
-        parts = [replace(p, row=p.row + f) for p, f in zip(parts, first)]
-        return UnitingEquations(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(UnitingEquations)))
+        if len(parts) == 1:
+            return parts[0]
+        every = [(p.node, p.direction, p.gap, p.active, p.row, p.followed, p.coefficients) for p in parts]
+        lists: list[Any] = list(zip(*every))
+        first = np.cumsum([0, *map(len, lists[0])])
+        lists[4] = [row + f for row, f in zip(lists[4], first)]
+        return UnitingEquations(*map(np.concatenate, lists))
 
     def select(self, which: Bools) -> UnitingEquations:
         """The equations in a mask ``(m,)``, in the same order."""

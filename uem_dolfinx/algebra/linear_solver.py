@@ -109,9 +109,10 @@ class UnitedSolver:
         self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
 
     def begin_step(self) -> None:
-        """Let the sparsity of the constrained matrix, and the method of solution, depend on this step only."""
+        """Let sparsity and method of solution depend on this step only, but for preconditioners made of a constant K."""
         self._begins, self._of = True, None
-        self._kept.drop()
+        if not self.lasting:
+            self._kept.drop()
         for part in (self.condensed, self._united, self._unsymmetric):
             part.begin_step()
 
@@ -232,19 +233,18 @@ class UnitedSolver:
     def _condense(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, same: bool) -> bool:
         """Constrain the condensed problem if this is cheaper; whether it is done (collective).
 
-        A condensed solve costs two solves of the bodies, a factorisation about ten. So condensation pays if K is constant, if Q is not
-        P (no factorisation is kept then), or from the second matrix of a K on. A kept factorisation that can be used is noted.
+        A condensed solve costs two solves of the bodies, a factorisation about ten. So condensation pays if K is constant, or from the
+        second matrix of a K on. A kept factorisation that can be used is noted.
         """
         again, self._of = self._of == (K, K.stateGet()), (K, K.stateGet())
         pays = not (self.iterative or self.space.mixed) and mumps.condenses(self.pc) and (P.n_equations > 0 or G is not None)
-        pays = pays and (self.lasting or self._petrov_galerkin or again)
+        pays = pays and (self.lasting or again)
         serves = pays and self.condensed.serves(P, Q, K, G)
-        first = self.lasting or self._petrov_galerkin
-        if not serves and not (first and pays and self._factorise_inside(P, Q, K, G)):
+        if not serves and not (self.lasting and pays and self._factorise_inside(P, Q, K, G)):
             if not self._petrov_galerkin and self._kept.serves(P, K):
                 self._served = P, K, G
                 return False
-            if first or not (pays and self._factorise_inside(P, Q, K, G)):
+            if self.lasting or not (pays and self._factorise_inside(P, Q, K, G)):
                 return False
         if not (serves and same):
             self.condensed.unite(P, Q, G)

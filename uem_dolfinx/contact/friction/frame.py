@@ -23,7 +23,7 @@ class Frame:
         away: vectors from the anchors to the contactors, or relative motions since the last step ``(n, gdim)``.
         tangents: tangential directions ``(n, gdim - 1, gdim)``.
         free_tangents: tangential directions in which the relative motion is not prescribed ``(n, gdim - 1, gdim)``.
-        other_normals: normals of other rigid surfaces that hold the contactors, or zero ``(n, k, gdim)``.
+        other_normals: normals of other rigid surfaces that hold the contactors, or zero ``(n, k, gdim)``; k is 0 if none holds any.
         prescribed: whether any contactor has a Dirichlet condition.
         cornered: contactors held in a corner, with friction only along its edge ``(n,)``.
     """
@@ -82,6 +82,8 @@ class Frame:
             away: relative motions ``(n, gdim)``.
             left_out: tangents with redundant equations, where more conditions meet than the target can follow ``(n, gdim - 1)``.
         """
+        if not (self.prescribed or self.other_normals.shape[1]):
+            return np.zeros(len(away))
         along = stick_slip.along(self.tangents, away) - stick_slip.along(self.free_tangents, away)
         told = np.where(self.other_normals.any(axis=(1, 2)), np.linalg.norm(along, axis=1), 0.0)
         if not self.prescribed:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, cross_products
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.contact.friction.frame import Frame
 from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows, without_terms
 from uem_dolfinx.contact.seam.relative_motion import Ties
@@ -46,27 +47,30 @@ def with_friction(
     none, place = np.zeros(m := len(contactor)), np.full(len(normal), -1, dtype=np.int64)
     place[contactor] = np.arange(m)
     T, of_friction, stick, s = (of_all[contactor] for of_all in (frame.free_tangents, of_friction, stick, directions))
-    slipping, away = of_friction & ~stick, np.einsum("nrg,ng->nr", T, frame.away[contactor])
+    slipping, away = of_friction & ~stick, np.einsum("nrg,ng->rn", T, frame.away[contactor])
     turned = np.where(slipping[:, None], -slope[contactor, None] * s, 0.0)
     slips = reduced(comm, bool(turned.any()), op=MPI.LOR)
     # rows of sticking contactors are the same in P and Q if they have the current weights
     apart = not pointwise and (own.moved is not None or slips or not keeps_ties)
 
-    def along(t: Array, gap: Array, active: Bools, ties: Ties) -> UnitingEquations:
-        there = place[ties.row] >= 0
-        row, weight = place[ties.row[there]], ties.weight[there, None]
-        return UnitingEquations(own.rows.node[:m], t, gap, active, row, ties.followed[there], weight * t[row])
+    def along(node: Ints, t: Array, gap: Array, active: Bools, ties: Ties) -> UnitingEquations:
+        there, k = place[ties.row] >= 0, np.arange(len(node) // max(m, 1))[:, None]
+        row, weight = (place[ties.row[there]] + m * k).ravel(), np.tile(ties.weight[there], len(k))
+        return UnitingEquations(node, t, gap, active, row, np.tile(ties.followed[there], len(k)), weight[:, None] * t[row])
 
-    def tangential(r: int) -> ContactRows:
-        resisted = of_friction & T[:, r].any(axis=1)
-        here = along(T[:, r], away[:, r], resisted & stick, frame.ties)
-        moved = along(T[:, r], away[:, r], resisted & stick, frame.way) if apart else None
-        return ContactRows(here, contactor, np.full(m, NORMAL), np.full(m, r), moved, None, resisted)
-
+    # all rows along the first tangents, then along the second ones
+    node: Any = own.rows.node[:m]
+    k = g - 1
+    t = np.concatenate([T[:, r] for r in range(k)])
+    resisted = np.tile(of_friction, k) & t.any(axis=1)
+    how = np.tile(node, k), t, away.ravel(), resisted & np.tile(stick, k)
+    numbers = np.tile(contactor, k), np.full(k * m, NORMAL), np.repeat(np.arange(k), m)
+    moved = along(*how, frame.way) if apart else None
+    tangential = ContactRows(along(*how, frame.ties), *numbers, moved, None, resisted)
     tilt = crosswise = None
     if slips:
         rest = without_terms(own.rows.select(np.arange(len(own)) >= m))
-        tilt = UnitingEquations.join([along(turned, none, slipping, frame.ties), rest], g)
+        tilt = UnitingEquations.join([along(node, turned, none, slipping, frame.ties), rest], g)
     if g == 3:
-        crosswise = along(cross_products(normal[contactor], s), none, slipping, frame.ties)
-    return ContactRows.join([replace(own, tilt=tilt, crosswise=crosswise), *(tangential(r) for r in range(g - 1))], [], g)
+        crosswise = along(node, cross_products(normal[contactor], s), none, slipping, frame.ties)
+    return ContactRows.join([replace(own, tilt=tilt, crosswise=crosswise), tangential], [], g)

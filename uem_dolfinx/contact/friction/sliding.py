@@ -9,8 +9,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from mpi4py import MPI
-
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
@@ -77,6 +75,8 @@ class Sliding:
         self._other_normals: Array = np.zeros((n, 0, g))
         self._anchors: Array = np.zeros((n, g))
         self._held_by: tuple[Ints, Ints, Array] | None = None
+        #: The last slip directions, with the frame and the vectors that they are made of.
+        self._directed: tuple[Frame, Array, Array] | None = None
         self._last: LastStep | None = None
         self.pivot = Pivot.begin(np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
 
@@ -125,8 +125,11 @@ class Sliding:
 
     def meet(self, kinematics: Kinematics, normals: Array) -> None:
         """Set the normals of other rigid surfaces that hold contactors ``(n, k, gdim)``, along which no slip is possible (collective)."""
-        if reduced(self.config.comm, not np.array_equal(normals, self._other_normals), op=MPI.LOR):
-            self._other_normals = normals
+        before, some = self._other_normals, bool(normals.any())
+        other = some if not before.shape[1] else not np.array_equal(normals, before)
+        other, some = reduced(self.config.comm, np.array([other, some])) > 0
+        if other:
+            self._other_normals = normals if some else normals[:, :0]
             self.replace(kinematics)
 
     def active(self, state: PairState) -> Bools:
@@ -139,7 +142,10 @@ class Sliding:
 
     def directions(self, state: PairState) -> Array:
         """Slip directions in the current tangent plane ``(n, gdim)``; zero for contactors that do not slip."""
-        return self.frame.directions(_of(state).direction)
+        found, of = self._directed, (self.frame, _of(state).direction)
+        if found is None or found[0] is not of[0] or found[1] is not of[1]:
+            self._directed = found = *of, self.frame.directions(of[1])
+        return found[2]
 
     def distances(self, state: PairState, redundant: Bools) -> Array:
         """Distances of sticking contactors from their anchors, zero for others, lengths ``(n,)``."""

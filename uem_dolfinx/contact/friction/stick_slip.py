@@ -110,6 +110,8 @@ def tangents(normals: Array, free: Bools) -> Array:
         found = np.stack([across, cross_products(first, across)], axis=1)
     size = np.linalg.norm(found, axis=2, keepdims=True)
     found /= np.where(size > 0, size, 1.0)
+    if normals.shape[1] == 1 and free.all():
+        return found
     more = np.flatnonzero(normals[:, 1:].any(axis=(1, 2)) | ~free.all(axis=1))
     if len(more):
         found[more] = _left_by(normals[more], free[more])

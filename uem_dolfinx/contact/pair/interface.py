@@ -253,7 +253,7 @@ class Interface(Readings):
         if self.friction is None:
             return
         normals = np.zeros((len(self.nodes), len(others), self.config.gdim))
-        for k, other in enumerate(others):
+        for k, other in ((k, other) for k, other in enumerate(others) if other.trial.active.any()):
             _, own, theirs = np.intersect1d(self.nodes, other.nodes, return_indices=True)
             normals[own, k] = np.where(other.trial.active[theirs, None], other.projection.normal[theirs], 0.0)
         self.friction.meet(self.kinematics, normals)
@@ -299,7 +299,8 @@ class Interface(Readings):
         """
         lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
         if lacks:
-            self.reserved = self.kinematics.ends.near(self.trial) & ~self.tied if known else self.trial.active.copy()
+            near = self.kinematics.ends.near(self.trial, self.max_penetration)
+            self.reserved = near & ~self.tied if known else self.trial.active.copy()
         own = self.kinematics.gap_rows.select(np.flatnonzero(self.reserved), self.trial.active)
         if self.friction is not None:
             own = self.friction.equations(own, self.trial, self.kinematics)

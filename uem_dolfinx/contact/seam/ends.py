@@ -70,9 +70,11 @@ class Ends:
         near = (self.projection.from_end <= END_HOLDS) & ~self.past(state) & self.holds
         return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
 
-    def near(self, state: PairState) -> Bools:
-        """Contactors that are active, or not past an end and within one facet size of the target ``(n,)``."""
-        return state.active | ((self.projection.gap < self.projection.facet_size) & ~self.past(state))
+    def near(self, state: PairState, reach: float) -> Bools:
+        """Contactors that are active, or not past an end and within one facet of the target, or ``reach`` of a rigid one ``(n,)``."""
+        size = self.projection.facet_size
+        within = self.projection.gap < np.where(np.isfinite(size), size, reach)
+        return state.active | (within & ~self.past(state))
 
 
 def slide_off(state: PairState, off: Bools) -> PairState:

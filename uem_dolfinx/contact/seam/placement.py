@@ -7,7 +7,7 @@ and forces only, not on rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -85,24 +85,21 @@ class ContactRows:
     def join(cls, parts: Sequence[ContactRows], more: Sequence[UnitingEquations], block: int) -> ContactRows:
         """All rows of several lists, followed by ``more`` equations of users."""
         parts = [*parts, *(cls.straight(e, *np.full((2, len(e)), -1)) for e in more)]
-
-        def lists(of: Callable[[ContactRows], UnitingEquations]) -> UnitingEquations:
-            return UnitingEquations.join([of(p) for p in parts], block)
-
-        def some(name: str) -> bool:
-            return any(getattr(p, name) is not None for p in parts)
-
-        numbers = [np.stack((p.contactor, p.kind, p.tangent)) for p in parts]
-        contactor, kind, tangent = np.concatenate([np.zeros((3, 0), np.int64), *numbers], axis=1)
+        if len(parts) == 1:
+            return parts[0]
+        none: list[Ints] = [np.zeros(0, np.int64)]
+        join, crosswise = UnitingEquations.join, [p.crosswise for p in parts if p.crosswise is not None]
+        moved, tilted = any([p.moved is not None for p in parts]), any([p.tilt is not None for p in parts])
+        resisted = any([p.resisted is not None for p in parts])
         return cls(
-            lists(lambda p: p.rows),
-            contactor,
-            kind,
-            tangent,
-            moved=lists(lambda p: p.P) if some("moved") else None,
-            tilt=lists(lambda p: p.tilt or without_terms(p.rows)) if some("tilt") else None,
-            resisted=np.concatenate([p.resisting.active for p in parts]) if some("resisted") else None,
-            crosswise=UnitingEquations.join([p.crosswise for p in parts if p.crosswise], block) if some("crosswise") else None,
+            join([p.rows for p in parts], block),
+            np.concatenate(none + [p.contactor for p in parts]),
+            np.concatenate(none + [p.kind for p in parts]),
+            np.concatenate(none + [p.tangent for p in parts]),
+            moved=join([p.P for p in parts], block) if moved else None,
+            tilt=join([p.tilt or without_terms(p.rows) for p in parts], block) if tilted else None,
+            resisted=np.concatenate([p.resisting.active for p in parts]) if resisted else None,
+            crosswise=join(crosswise, block) if crosswise else None,
         )
 
     @property

@@ -213,6 +213,19 @@ class BodyState(IterationState):
         else:
             solver.take(self.solved, self.trial, K, G, self.test)
 
+    def settle_ahead(
+        self, bodies: Bodies, solver: UnitedSolver, pairs: Sequence[Interface], F: Callable[[], PETSc.Vec], G: PETSc.Mat | None
+    ) -> Solved | None:
+        """Solve the first problem of a time step with friction on arrays, see ``Rows.settle``, if other states are factorised anew.
+
+        Contactors within reach are those that the velocity of the last step's end brings together (collective).
+        """
+        dynamics = bodies.dynamics
+        if dynamics is None or solver.lasting or solver.iterative or not any(pair.frictional for pair in pairs):
+            return None
+        du = dynamics.dt * dynamics.velocity.x.array[: bodies.forces.size].reshape(-1, bodies.config.gdim)
+        return self.rows.settle(bodies, F(), G, du)
+
     def with_pressures(self, K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
         """The state with the derivatives of heat by pressures, if pressures are forces of single contactors (collective).
 

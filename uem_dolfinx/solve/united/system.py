@@ -299,10 +299,8 @@ class BodySystem:
             costly = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap)
             if costly and (solved := state.rows.settle(self.bodies, self.residual(), self.curvature, increment)):
                 return self._with_rows(state, solved)
-            if self._adrift:
-                chosen = violated if count(self.pairs, violated) else None
-            else:
-                chosen = self.exchanges.choose(violated, gaps, self.curvature is not None, way)
+            any_left = violated if self._adrift and count(self.pairs, violated) else None
+            chosen = any_left if self._adrift else self.exchanges.choose(violated, gaps, self.curvature is not None, way)
             if chosen is None and sliding is not None and not self.exchanges.frozen:
                 raise united_rows.not_held()
             if chosen is None or self._adrift:
@@ -402,6 +400,8 @@ class BodySystem:
         if iteration is not None:
             self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
+        if iteration == 0 and (solved := state.settle_ahead(self.bodies, self.solver, self.near, self.residual, self.curvature)):
+            state = self._with_rows(state, solved)
         K, P, Q, c = self.bodies.tangent.K, state.trial, state.test, state.trial.c
         state = state.with_pressures(K, self.curvature) if self._heats else state
         curvature = together(self.curvature, state.added)
