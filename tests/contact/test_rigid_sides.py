@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from body_scenes import surface_of
 from dolfinx import fem
-from helpers import at, box, clamp, linear, run, scene, slow
+from helpers import MESHES, at, box, clamp, linear, run, scene, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -99,6 +99,17 @@ def test_equal_facets(caplog):
     for number, (across, half) in enumerate(((1.0, 0.398), (0.8, 0.4)), 1):
         punch_on_block("quadrilateral", across, rigid_first=True, half=half)
         assert warned(caplog) == number
+
+
+def test_held_ends_of_soft_rods(caplog):
+    """In general contact, parts have the facets of some faces; held faces make no rigid body."""
+    sizes = {"length": 24.0, "n_1": 6, "n_2": 6, "m": 2, "on_edge": 1, "angle": 0.5 * np.pi}
+    mesh, tags = uem.read_gmsh(MESHES / "crossed_rods.geo", COMM, gdim=3, parameters=sizes)
+    u = fem.Function(compat.function_space(mesh, 1, (3,)))
+    bcs = [uem.dirichlet(u.function_space, tags[f"ends {k}"]) for k in (1, 2)]
+    contact = uem.GeneralContact(coupling="mortar", bodies={f"rod {k}": tags[f"rod {k}"] for k in (1, 2)})
+    uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact])
+    assert warned(caplog) == 0
 
 
 @slow

@@ -187,6 +187,10 @@ class ContactResults(HeatResults):
         """Contactors that conduct heat when they touch; only one of two that follow each other ``(n_contactors,)`` (collective)."""
         return np.ones(len(self.nodes), bool)
 
+    def whole_side(self) -> Indices:
+        """Owned nodes that are all rigid if the contactors' side is rigid: the contactors (collective)."""
+        return self.nodes
+
     @property
     def nodes(self) -> Indices:
         """Owned contactor nodes of this rank, block indices of the displacement's space ``(n_contactors,)``."""

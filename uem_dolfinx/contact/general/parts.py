@@ -59,6 +59,14 @@ class GeneralPart(Contact):
             return None
         return self._by_pairs.now(np.full(len(nodes), -1))
 
+    def whole_side(self) -> Indices:
+        """See ``ContactResults``: all surface nodes of the contactors' bodies, of which a single face may be held (collective)."""
+        skin, own = self._skin, np.zeros(self._skin.n_bodies, dtype=bool)
+        own[skin.body_of_node[self.pair.nodes]] = True
+        own = reduced(self.config.comm, own, op=MPI.LOR)
+        nodes = surface_nodes(self.config, skin.tag)
+        return nodes[own[skin.body_of_node[nodes]]]
+
 
 class RigidContact(GeneralPart):
     """Part of a general contact: all nodes with a rigid surface."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from uem_dolfinx.arrays import Bools
+from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.contact.both_sides import OfBothSides
 from uem_dolfinx.errors import ConvergenceError, UEMError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -46,8 +46,8 @@ class RigidSides:
         if (
             not meshed
             or contact.tied is True
-            or not self._whole(config, contact.contactor)
-            or self._whole(config, contact.target)
+            or not self._whole(config, contact.whole_side())
+            or self._whole(config, surface_nodes(config, contact.target))
         ):
             return
         own, theirs = (_side(config, tag) for tag in (contact.contactor, contact.target))
@@ -58,9 +58,11 @@ class RigidSides:
                 contact.name, own, theirs,
             )  # fmt: skip
 
-    def _whole(self, config: Configuration, tag: Tag) -> bool:
-        """Whether all nodes of a surface are rigid (collective)."""
-        return not reduced(config.comm, int((~self._rigid[surface_nodes(config, tag)]).sum()))
+    def _whole(self, config: Configuration, nodes: Indices) -> bool:
+        """Whether there are ``nodes (k,)``, all of them rigid (collective)."""
+        rigid = self._rigid[nodes]
+        some, free = reduced(config.comm, np.array([len(rigid), (~rigid).sum()]))
+        return bool(some) and not free
 
     def advise(self, error: UEMError) -> None:
         """Add advice to a ConvergenceError if equations of rigid contactors depend on others in the present state (collective)."""
