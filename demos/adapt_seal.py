@@ -95,13 +95,8 @@ rows = [
     }
     for i, (number, one) in enumerate(zip(unknowns, measured))
 ]
-results = {
-    "rows": rows,
-    "force": exact,
-    "goal_error": abs(rows[adapted - 1]["error"]),
-    "effectivity": rows[adapted - 1]["effectivity"],
-    "reached": found.reached,
-}
+results = {"rows": rows, "force": exact, "reached": found.reached}
+results |= {"goal_error": abs(rows[adapted - 1]["error"]), "effectivity": rows[adapted - 1]["effectivity"]}
 common.report(args, results)
 
 # %% [markdown]

@@ -68,7 +68,7 @@ def test_ranks_receive_what_is_theirs(comm, n):
     """Few contactors ask several ranks, and what a rank receives is what its own contactors and facets need."""
     found = search_traffic(plates(n))
     assert found["contactors"] == (n + 1) ** 2 and found["facets"] == round(0.8 * n) ** 2
-    assert found["asked"] <= 1.25
+    assert found["searched_ranks"] <= 1.25
     if comm.size == 1:
         assert found["bytes_max"] == 0 and found["imbalance"] == 1.0
     else:
