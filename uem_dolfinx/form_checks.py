@@ -110,9 +110,19 @@ def _check_mesh(what: str, form: Any, domain: Any = None) -> None:
 
     Raises:
         SpaceError: names the object of another mesh.
+        InputError: for an integral over a numbered part without tags.
     """
     own = None if domain is None else domain.ufl_domain()
+    tagged = {integral.integral_type() for integral in form.integrals() if integral.subdomain_data() is not None}
     for integral in form.integrals():
+        kind, part = integral.integral_type(), integral.subdomain_id()
+        if kind not in tagged and part not in ("everywhere", "otherwise"):
+            measure = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}.get(kind, kind)
+            ours = f"uem.{measure}(tag), or " if measure in ("dx", "ds") else ""
+            raise InputError(
+                f"{what} has an integral over {measure}({part}) without tags, so over nothing: expected {ours}"
+                f"ufl.Measure('{measure}', subdomain_data=tags)({part})"
+            )
         own = own or integral.ufl_domain()
         if integral.ufl_domain() != own:
             raise SpaceError(f"{what} is integrated over another mesh: expected {_mesh(domain)}; take ufl.dx(domain=mesh) of it")

@@ -6,8 +6,9 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
-from helpers import blocks, clamp, highest, raised
+from helpers import blocks, clamp, highest, linear, raised, refused, run
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
@@ -102,3 +103,27 @@ def test_dirichlet_of_what_cannot_be():
         (uem.TagError, "expected a tag", (V, "top")),
     ):  # fmt: skip
         raised(error, match, lambda given=given: uem.dirichlet(*given))
+
+
+@pytest.mark.parametrize(("off", "warned"), [(0.5, 1), (3e-9, 1), (3e-10, 0), (0.0, 0)])
+@pytest.mark.parametrize("size", [1e-9, 1e3])
+def test_two_conditions_at_a_node(caplog, size, off, warned):
+    """The last one counts, which is said where their values differ; not where they are equal, as at a common corner."""
+    b = blocks(COMM, "quadrilateral", pose=lambda x: size * x)
+    down = 0.01 * size
+    first, last = (uem.dirichlet(b.V, b.top, 1, -value) for value in (down, (1.0 + off) * down))
+    bcs = [*clamp(b.V, b.bottom), uem.dirichlet(b.V, b.top, 0), first, last]
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, contacts=[uem.Contact(b.high, b.low)])
+    run(problem, 2)
+    assert highest(COMM, -b.u.x.array) == pytest.approx((1.0 + off) * down, rel=1e-12)
+    assert COMM.bcast(sum("bcs[3]" in r.getMessage() and "counts" in r.getMessage() for r in caplog.records)) == warned
+
+
+@pytest.mark.parametrize("measure", ["dx", "ds", "dS"])
+def test_parts_without_tags(measure):
+    """A number alone names no part of the mesh; a measure with tags does."""
+    b = blocks(COMM, "quadrilateral")
+    v, whole = ufl.TestFunction(b.V), ufl.Measure(measure, domain=b.scene.mesh)
+    load = (ufl.avg(v[1]) if measure == "dS" else v[1]) * whole(3)
+    words = [f"{measure}(3)", "tags", f"ufl.Measure('{measure}'"]
+    refused(uem.InputError, words, lambda: uem.UnitedProblem(linear(b.u, 1.0) + load, b.u, bcs=clamp(b.V, b.bottom)))

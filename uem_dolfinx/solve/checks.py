@@ -21,6 +21,7 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.form_checks import check_linear, check_parts
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.log import logger
 from uem_dolfinx.materials.elastic import HistoryMaterial, is_history_material, material_of
 from uem_dolfinx.parallel import agreed
 
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.dynamics.inertia import Dynamics
 
+#: Values of two Dirichlet conditions of one component are equal if they differ by less than this part of the larger.
+#: [convention; values; test_dirichlet.py::test_two_conditions_at_a_node]
+SAME_VALUE = 1e-9
 #: Laws with history that belong to problems, by their ids.
 _taken: WeakValueDictionary[int, Any] = WeakValueDictionary()
 
@@ -207,6 +211,8 @@ def check_values(problem: Any, wanted: Array) -> None:
     """
     with agreed(problem.comm):
         _check_finite(problem.config, problem.bodies.bcs, wanted)
+    if problem.progress.steps == 0:
+        _warn_of_two_values(problem.config, problem.bodies.bcs, wanted)
     if problem.comm.size == 1:
         return
     points = [] if problem.bodies.points is None else [one for one, _ in problem.bodies.points.parts]
@@ -231,3 +237,23 @@ def _check_finite(config: Configuration, bcs: Sequence[Any], wanted: Array) -> N
                 f"the Dirichlet condition bcs[{i}] prescribes {wanted[bad[0]]} in {config.place_of(int(bad[0]))}: "
                 "expected finite values; check its value and what the load sets"
             )
+
+
+def _warn_of_two_values(config: Configuration, bcs: Sequence[Any], wanted: Array) -> None:
+    """Warn of the first component of a node that two Dirichlet conditions give different values, of which the last counts (collective)."""
+    own, found = np.empty_like(wanted), None
+    for i, bc in enumerate(bcs):
+        dofs = compat.bc_dofs(bc)[0]
+        compat.set_bc_values(own, [bc])
+        other = np.abs(own[dofs] - wanted[dofs]) > SAME_VALUE * np.maximum(np.abs(own[dofs]), np.abs(wanted[dofs]))
+        if other.any():
+            k = int(dofs[np.argmax(other)])
+            found = i, float(own[k]), float(wanted[k]), config.place_of(k)
+            break
+    every = [one for one in config.comm.allgather(found) if one is not None]
+    if every:
+        i, first, last, where = min(every)
+        logger.warning(
+            "the Dirichlet condition bcs[%d] prescribes %.6g in %s, where a later condition prescribes %.6g, which counts: leave one of "
+            "them out at this node", i, first, where, last,
+        )  # fmt: skip
