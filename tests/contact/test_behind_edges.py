@@ -95,3 +95,20 @@ def test_gaps_of_contactors_behind_edges(cell, sliding, scale):
         left = pair.projection.gap - p.gap - h * (gaps(du) - p.gap)
         error.append(COMM.allreduce(float(np.abs(left)[past].max(initial=0.0)), op=MPI.MAX))
     assert error[1] < 0.02 * error[0] and error[0] < 1e-4 * scale
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0])
+@pytest.mark.parametrize(("slope", "goes_on"), [(0.03, True), (0.2, True), (0.3, False), (2.0, False)])
+def test_shallow_edges(slope, goes_on, scale):
+    """A node straight below the bottom of a V is beside its facets by slope times its depth; facets of sharp ones end at the bottom."""
+    low, high = box("triangle", [-1.0, -1.0], [1.0, 0.0], [2, 1]), box("triangle", [-0.1, -0.02], [0.1, 0.3], [2, 1])
+    s = scene(COMM, "triangle", [low, high], pose=lambda x: scale * (x + np.column_stack([0 * x[:, 0], slope * np.abs(x[:, 0])])))
+    u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+    F = uem.LinearElastic(1.0, 0.3, "plane_strain").residual(u, ufl.TestFunction(u.function_space)) * ufl.dx
+    contact = uem.Contact(s.tag("foot", 1, at(1, -0.02)), s.tag("low", 0, at(1, 0.0)), max_penetration=scale)
+    uem.UnitedProblem(F, u, contacts=[contact])
+    pair = contact.pair
+    bottom = np.abs(pair.config.X[pair.nodes, 0]) < 1e-3 * scale
+    weights = pair.projection.weights[bottom]
+    assert COMM.allreduce(len(weights)) == 1
+    assert COMM.allreduce(int(((weights < -1e-6) | (weights > 1 + 1e-6)).any())) == goes_on

@@ -14,6 +14,10 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 #: A way from the foot that is shorter, in lengths of the facet, or leans from its normal by less, is rounding.
 #: [bound; cosine, and length of the facet; test_offset_edges.py::test_points_on_their_feet]
 ALONG_NORMAL = 1e-12
+#: Facets go on below points that are behind an edge and beside them by less than this part of their depth; at sharper edges, which hold
+#: points by both facets, they do not.
+#: [convention; slope; test_behind_edges.py::test_shallow_edges]
+SHALLOW = 0.25
 #: Offsets of less than this part of the facet do not round a convex edge: Newton's steps are longer than such an arc.
 #: [heuristic; length of the facet; test_offset_edges.py::test_what_rounds_an_edge]
 ROUNDS_AN_EDGE = 1e-2
@@ -206,9 +210,10 @@ class FacetProjection:
         return replace(self, gap=np.where(beside, side * length, self.gap), normal=np.where(beside[:, None], n, self.normal))
 
     def behind_edges(self, points: Array) -> Ints:
-        """Which ``points (n, gdim)`` are inside the target, and below no point of their facet, but behind one of its concave edges."""
+        """Which ``points (n, gdim)`` are inside the target, and below no point of their facet, but behind a shallow concave edge of it."""
         beside = np.linalg.norm(points - self.foot - self.height[:, None] * self.normal, axis=1)
-        return np.flatnonzero((self.height < 0.0) & (beside > ALONG_NORMAL * self.facet_size) & ~self.beyond.any(axis=1))
+        behind = (beside > ALONG_NORMAL * self.facet_size) & (beside < SHALLOW * -self.height)
+        return np.flatnonzero(behind & ~self.beyond.any(axis=1))
 
     def take(self, which: Ints) -> FacetProjection:
         """Some of its rows ``(k,)``."""
