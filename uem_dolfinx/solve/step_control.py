@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx import errors
-from uem_dolfinx.dynamics.scheme import MOST_GIVEN, SHORTEST_GIVEN
 from uem_dolfinx.log import logger
 
 #: A step may be cut to this part of its nominal length.
@@ -92,6 +91,8 @@ class StepControl:
             kinetic: returns the kinetic energy of the bodies.
             held: returns other energy at work.
         """
+        from uem_dolfinx.dynamics.scheme import MOST_GIVEN
+
         if given <= MOST_GIVEN * self.largest_energy:
             return None
         self.largest_energy = max(self.largest_energy, kinetic())
@@ -101,6 +102,8 @@ class StepControl:
 
     def refuse_energy(self, words: str, length: float, again: bool = False) -> None:
         """Refuse a step in which contacts give too much energy, or warn of it where the step is short and not better ``again``."""
+        from uem_dolfinx.dynamics.scheme import SHORTEST_GIVEN
+
         if length > SHORTEST_GIVEN * self.nominal or again:
             raise errors.EnergyGivenError(words)
         logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)

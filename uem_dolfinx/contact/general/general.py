@@ -21,7 +21,6 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, COUPLINGS, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, RigidContact
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
-from uem_dolfinx.contact.general.touching import Pair, Touch, between, sums_of_pairs
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, given_normal
 from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
@@ -34,6 +33,7 @@ from uem_dolfinx.parallel import agreed
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.general.pair_friction import FrictionOfPairs
+    from uem_dolfinx.contact.general.touching import Pair, Touch
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.geometry.skin import Apart
 
@@ -386,6 +386,8 @@ class GeneralContact(OfProblem, given.Sealed):
         return [(one.touch, one.moment) for one in sums if one.touch.n_active or one.touch.force.any()]
 
     def _sums_of_pairs(self, about: npt.ArrayLike | None = None, field: int | None = None) -> list[Pair]:
+        from uem_dolfinx.contact.general.touching import sums_of_pairs
+
         g, rigid = self._config.gdim, [self._rigid_name(part) for part in self.parts]
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
         field = self.heats[0].field if self.heats and field is None else field
@@ -419,6 +421,8 @@ class GeneralContact(OfProblem, given.Sealed):
         return self._between(first, second, None, of)[1]
 
     def _between(self, first: str, second: str | None, about: Any, field: int | None = None) -> tuple[Resultant, float]:
+        from uem_dolfinx.contact.general.touching import between
+
         names = (*self._names, *(self._rigid_name(part) for part in self.parts if isinstance(part, RigidContact)))
         none = np.zeros((0, self._config.gdim))
         return between(self._sums_of_pairs(about, field), names, first, second, sum_up(self._config.comm, none, none))

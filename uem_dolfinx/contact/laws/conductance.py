@@ -15,7 +15,6 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.laws.constants import checked
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import agreed, ask_together
 
@@ -62,6 +61,8 @@ class Conductance(given.Sealed):
         joule: int | None = None,
         joule_share: float = 0.5,
     ):
+        from uem_dolfinx.contact.laws.constants import checked
+
         self.h = h if callable(h) else given.number("h", h, CONDUCTANCE)
         self.field = given.part_number("field", field, "the temperature")
         self.temperature = temperature if temperature is None else checked("temperature", temperature, given.FINITE)

@@ -64,7 +64,7 @@ class OnTarget:
             changed["prescribed"] = bool(reduced(self.config.comm, int(not self.free.all())))
         if "offset" in changed:
             self._projected = None
-        self.setting = replace(self.setting, **changed)
+        self.setting = self.setting._replace(**changed)
 
     @property
     def offset(self) -> Array | None:

@@ -330,8 +330,7 @@ class Traits(NamedTuple):
     order: int = -1
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """Conditions, offset and friction of the contactors of a discretisation, for all placements until a part is set anew.
 
     Attributes:

@@ -11,13 +11,10 @@ from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.solve import checks
-from uem_dolfinx.solve.memory import take_back
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
-from uem_dolfinx.solve.steps.by_error import ByError
 from uem_dolfinx.solve.steps.by_load import ByLoad
 from uem_dolfinx.solve.steps.dissipation import Dissipation
-from uem_dolfinx.solve.steps.limit_points import LimitPoint
 from uem_dolfinx.solve.steps.load_step import LoadStep
 
 if TYPE_CHECKING:
@@ -155,6 +152,9 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         except UEMError as error:
             if progress.control.shorten(way.tried, error):
                 continue
+            from uem_dolfinx.solve.memory import take_back
+            from uem_dolfinx.solve.steps.limit_points import LimitPoint
+
             limit = LimitPoint(problem, arc=not isinstance(way, ByLoad))
             take_back(problem, done)
             limit.name(error, done, unstable)
@@ -168,7 +168,11 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
 
 def _by_load(problem: UnitedProblem, tolerance: float | None) -> ByLoad:
     """Steps of given load, with a tolerance for their error or without."""
-    return ByLoad(problem) if tolerance is None else ByError(problem, tolerance)
+    if tolerance is None:
+        return ByLoad(problem)
+    from uem_dolfinx.solve.steps.by_error import ByError
+
+    return ByError(problem, tolerance)
 
 
 def check_steps(problem: Any, checkpoint: Any) -> None:
