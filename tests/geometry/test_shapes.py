@@ -52,6 +52,18 @@ def test_closest_point_of_one_facet(cell, degree):
     assert np.abs(np.sqrt(d2) - expected).max() < 1e-7
 
 
+@pytest.mark.parametrize("cell,degree", KINDS)
+def test_closest_points_of_collapsed_facets(cell, degree):
+    """A facet in one point, as an attempt may leave it, has its distance; all others are found as without it."""
+    shape, rng = facet_shape(cell, degree), np.random.default_rng(5)
+    x, p = random_facets(shape, 6, rng, 0.05), rng.uniform(-0.5, 1.5, (6, shape.dim + 1))
+    alone = closest_point(shape, x[1:], p[1:])
+    x[0] = [0.25, 0.5, -1.0][: shape.dim + 1]
+    xi, d2 = closest_point(shape, x, p)
+    assert shape.contains(xi).all() and d2[0] == pytest.approx(((p[0] - x[0, 0]) ** 2).sum(), rel=1e-13)
+    assert np.abs(xi[1:] - alone[0]).max() < 1e-13 and np.abs(d2[1:] - alone[1]).max() < 1e-13
+
+
 @pytest.mark.parametrize("cell", ["interval", "triangle"])
 def test_straight_facets_by_formula(cell):
     """Barycentric formulas of a segment and of a triangle's inside."""

@@ -234,9 +234,18 @@ def beneath(shape: FacetShape, x: Array, xi: Array, places: Array) -> tuple[Arra
     t = tangents(tab, x)
     for _ in range(1 if shape.affine else IN_PLANE):
         missing = np.einsum("nfg,ng->nf", t, places - np.einsum("na,nag->ng", tab.N, x))
-        xi = xi + np.linalg.solve(np.einsum("nfg,neg->nfe", t, tangents(tab, x)), missing[..., None])[..., 0]
+        xi = xi + _solved(np.einsum("nfg,neg->nfe", t, tangents(tab, x)), missing)
         tab = shape.tabulate(xi)
     return xi, tab
+
+
+def _solved(m: Array, right: Array) -> Array:
+    """Solutions ``(n, fdim)`` of ``m (n, fdim, fdim)`` with ``right (n, fdim)``; ``right`` itself for facets that have collapsed."""
+    try:
+        return np.asarray(np.linalg.solve(m, right[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        flat = np.linalg.det(m) == 0.0
+        return np.asarray(np.linalg.solve(np.where(flat[:, None, None], np.eye(m.shape[1]), m), right[..., None])[..., 0])
 
 
 def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) -> tuple[Array, Array]:
@@ -245,7 +254,7 @@ def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) ->
     if shape.affine:
         tab = shape.at_middle(len(p))
         t, r = tangents(tab, x), p - np.einsum("na,nag->ng", tab.N, x)
-        xi += np.linalg.solve(np.einsum("nfg,neg->nfe", t, t), np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
+        xi += _solved(np.einsum("nfg,neg->nfe", t, t), np.einsum("nfg,ng->nf", t, r))
     for _ in range(0 if shape.affine else iterations):
         if not len(todo):
             break
@@ -256,7 +265,7 @@ def _stationary_point(shape: FacetShape, x: Array, p: Array, iterations: int) ->
         curved = m - np.einsum("ng,nag,nafe->nfe", r, x[todo], tab.ddN)
         convex = np.linalg.eigvalsh(curved)[:, 0] > 0.0
         m = np.where(convex[:, None, None], curved, m)
-        step = np.linalg.solve(m, np.einsum("nfg,ng->nf", t, r)[..., None])[..., 0]
+        step = _solved(m, np.einsum("nfg,ng->nf", t, r))
         xi[todo] += _descending(shape, x[todo], p[todo], xi[todo], np.clip(step, -1.0, 1.0))
         far = (np.abs(xi[todo] - 0.5) > 1.5).any(axis=1)
         todo = todo[(np.abs(step).max(axis=1) > 1e-15) & ~far]
