@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from body_scenes import surface_of
 from dolfinx import fem
-from helpers import MESHES, at, box, clamp, linear, run, scene, slow
+from helpers import MESHES, at, box, clamp, linear, run, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -101,7 +101,7 @@ def test_equal_facets(caplog):
         assert warned(caplog) == number
 
 
-@slow
+@pytest.mark.slow
 def test_held_ends_of_soft_rods(caplog):
     """In general contact, parts have the facets of some faces; held faces make no rigid body."""
     sizes = {"length": 24.0, "n_1": 6, "n_2": 6, "m": 2, "on_edge": 1, "angle": 0.5 * np.pi}
@@ -113,9 +113,8 @@ def test_held_ends_of_soft_rods(caplog):
     assert warned(caplog) == 0
 
 
-@slow
-@pytest.mark.parametrize("held", [False, True])
-@pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
+@pytest.mark.slow
+@pytest.mark.parametrize(("coupling", "held"), [("mortar", False), ("mortar", True), ("node_to_surface", False)])
 def test_the_error_says_what_helps(coupling, held):
     """The active set of dependent equations cycles; the error advises to exchange the surfaces, not to refine the target."""
     problem, _ = punch_on_block("quadrilateral", 0.5, rigid_first=True, coupling=coupling, held=held)
