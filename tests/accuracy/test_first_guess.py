@@ -62,7 +62,7 @@ def test_fewer_iterations(coupling):
     """A seal at large strain: the same force and meshes as by two load steps from zero, by at most half as many iterations."""
     found = [Seal(coupling).adapt(tolerance=1e-3, solve_again=again) for again in (None, lambda problem: problem.solve())]
     cold, warm = ([mesh.iterations for mesh in one.meshes] for one in found)
-    assert len(cold) == len(warm) > 2 and cold[0] == warm[0]
+    assert len(cold) == len(warm) > 1 and cold[0] == warm[0]
     assert sum(warm[1:]) <= 0.5 * sum(cold[1:])
     assert np.isclose(found[0].estimate.value, found[1].estimate.value, rtol=1e-6)
 
