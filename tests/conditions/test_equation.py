@@ -11,9 +11,9 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
+from body_scenes import of_quarters
 from dolfinx import fem
 from helpers import (
-    Body,
     M,
     at,
     blocks,
@@ -248,15 +248,7 @@ def test_contactors_that_an_equation_holds(lift):
 
 def ring(part, law=st_venant):
     """A quarter, or all, of a ring that shrinks onto a rigid cylinder under a pressure that changes four times around."""
-    n = 12 * part
-    body = box("quadrilateral", [1.0, 0.0], [1.3, 0.5 * np.pi * part], [2, n])
-    if part == 4:
-        # the last nodes are the first ones again
-        number = np.arange(len(body.x))
-        number[number % (n + 1) == n] -= n
-        used, cells = np.unique(number[body.cells], return_inverse=True)
-        body = Body(body.x[used], cells.reshape(body.cells.shape))
-    s = scene(COMM, "quadrilateral", [body], pose=lambda x: x[:, :1] * np.column_stack([np.cos(x[:, 1]), np.sin(x[:, 1])]))
+    s = of_quarters(COMM, part, 12)
     V = compat.function_space(s.mesh, 1, (2,))
     u, v, x = fem.Function(V, name="u"), ufl.TestFunction(V), ufl.SpatialCoordinate(s.mesh)
     inner, outer = s.tag("inner", 0, at(0, 1.0)), s.tag("outer", 0, at(0, 1.3))

@@ -183,3 +183,15 @@ def oedometer(b, places, counts, settlement):
                 end = b.side(k, axis, float(counts[axis]))
                 bcs += clamp(b.V, end, axis, value=-settlement if axis == b.g - 1 else 0.0)
     return bcs
+
+
+def of_quarters(comm, part, n):
+    """Scene of ``part`` quarters of a ring of radii 1 and 1.3, with ``n`` cells around each; tags are in polar coordinates."""
+    body = box("quadrilateral", [1.0, 0.0], [1.3, 0.5 * np.pi * part], [2, n := n * part])
+    if part == 4:
+        # the last nodes are the first ones again
+        number = np.arange(len(body.x))
+        number[number % (n + 1) == n] -= n
+        used, cells = np.unique(number[body.cells], return_inverse=True)
+        body = Body(body.x[used], cells.reshape(body.cells.shape))
+    return scene(comm, "quadrilateral", [body], pose=lambda x: x[:, :1] * np.column_stack([np.cos(x[:, 1]), np.sin(x[:, 1])]))

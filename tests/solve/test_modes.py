@@ -9,8 +9,9 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
+from body_scenes import of_quarters
 from dolfinx import fem, mesh
-from helpers import Body, at, blocks, box, clamp, linear, modulus, refused, run, scene
+from helpers import at, blocks, box, clamp, linear, modulus, refused, run, scene
 from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
@@ -153,15 +154,7 @@ def test_refused(monkeypatch):
 
 def of_ring(part, where=None):
     """All, or a quarter, of a ring in 12 or 3 cells around, of which a part may be shrunk onto a rigid disc, and its mass."""
-    n, turned = 3 * part, 0.5 * np.pi * part
-    body = box("quadrilateral", [1.0, 0.0], [1.3, turned], [2, n])
-    if part == 4:
-        # the last nodes are the first ones again
-        number = np.arange(len(body.x))
-        number[number % (n + 1) == n] -= n
-        used, cells = np.unique(number[body.cells], return_inverse=True)
-        body = Body(body.x[used], cells.reshape(body.cells.shape))
-    s = scene(COMM, "quadrilateral", [body], pose=lambda x: x[:, :1] * np.column_stack([np.cos(x[:, 1]), np.sin(x[:, 1])]))
+    s = of_quarters(COMM, part, 3)
     V = compat.function_space(s.mesh, 1, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     # stiffer where each sector has its first cells
@@ -170,7 +163,7 @@ def of_ring(part, where=None):
     F, equations = uem.LinearElastic(stiff, 0.3, kind="plane_strain").residual(u, v) * ufl.dx, []
     if part == 1:
         equations = [
-            uem.periodic(s.tag("second", 0, at(1, turned)), s.tag("first", 0, at(1, 0.0)), turn=[[0.0, -1.0], [1.0, 0.0]])
+            uem.periodic(s.tag("second", 0, at(1, 0.5 * np.pi)), s.tag("first", 0, at(1, 0.0)), turn=[[0.0, -1.0], [1.0, 0.0]])
         ]
     disc = uem.RigidSphere((0.0, 0.0), 1.01)
     contacts = [] if where is None else [uem.Contact(s.tag("inner", 0, where), disc)]

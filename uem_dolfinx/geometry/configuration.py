@@ -133,6 +133,10 @@ class Configuration(Nodes):
         """Current positions of the local nodes ``(n_local, gdim)``, ghosts included."""
         return self.X + self.displacement
 
+    def here(self, nodes: Any) -> Array:
+        """Current positions of local nodes, of an array of any shape ``(...)``: ``(..., gdim)``."""
+        return np.asarray(self.X[nodes] + self.displacement[nodes])
+
     @contextmanager
     def at(self, displacement: Array) -> Iterator[None]:
         """Context with other values of all unknowns including ghosts ``(n,)``."""

@@ -143,7 +143,7 @@ class TargetFacets:
     @property
     def x(self) -> Array:
         """Current positions of the facets' nodes ``(m, nn, gdim)``."""
-        return self.config.X[self.dofs] + self.config.displacement[self.dofs]
+        return self.config.here(self.dofs)
 
     def normals(self, drawn: bool = False) -> Array:
         """Outward unit normals of each facet at its nodes, current or, if ``drawn``, in the reference configuration ``(m, nn, gdim)``."""

@@ -87,8 +87,7 @@ class EdgeKinematics(PlacedOnTarget):
     @cached_property
     def ties(self) -> Ties:
         """Weights of the other nodes of both edges; multipliers are forces times the contactor's weight."""
-        of, free = self.of, self.of.setting.free if self.of.setting.prescribed else None
-        return Ties.of(of.config, of.nodes, self._terms, free, False, np.asarray(1.0 / self.share))
+        return self.of.ties(self._terms, np.asarray(1.0 / self.share))
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 

@@ -107,7 +107,7 @@ class Sliding:
         """Replace the kinematics at the same displacement (collective)."""
         if self.discretisation.traits.pointwise:
             way = None if self._held_by is None else Ties.of(self.config, self.nodes, self._held_by, None, True)
-            away = self._points - self._anchors
+            away = self.config.here(self.nodes) - self._anchors
         else:
             assert self._last is not None
             way = self._last.ties
@@ -115,10 +115,6 @@ class Sliding:
         self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.setting.prescribed)
         if of_rate(self.limits.law):
             self.limits.see(np.linalg.norm(self.frame.slip, axis=1) / kinematics.ties.share)
-
-    @property
-    def _points(self) -> Array:
-        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
 
     def _way_since(self, last: LastStep) -> Array:
         return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
@@ -396,7 +392,7 @@ class Sliding:
         if not self.discretisation.traits.pointwise:
             return f
         loose = ~f.stick | ~self.active(state) | self.frame.cornered
-        return anchored(f, kinematics, self.discretisation.target, self._points, loose, self.keeps_feet)
+        return anchored(f, kinematics, self.discretisation.target, self.config.here(self.nodes), loose, self.keeps_feet)
 
     def commit(self, state: PairState, committed: PairState, kinematics: Kinematics) -> PairState:
         """The state to be committed, with slips, work and new anchors (collective)."""

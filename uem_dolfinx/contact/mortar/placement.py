@@ -120,11 +120,10 @@ class MortarKinematics(PlacedOnTarget):
     @cached_property
     def ties(self) -> Ties:
         """Weights are integrals of dual functions times shape functions of both sides, over the integral of the contactor's own."""
-        of, rows = self.of, self.rows
+        rows = self.rows
         assert rows.weights is not None and rows.push is not None
         # relative to the sum of the facets' forces, each along its own derivative of the gap
-        share = np.asarray(rows.share / rows.push)
-        return Ties.of(of.config, of.nodes, rows.weights, of.setting.free if of.setting.prescribed else None, False, share)
+        return self.of.ties(rows.weights, np.asarray(rows.share / rows.push))
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 

@@ -169,8 +169,7 @@ class NodalKinematics(PlacedOnTarget):
     @cached_property
     def ties(self) -> Ties:
         """Weights are the shape functions at the closest points; see ``Kinematics``."""
-        of = self.of
-        return Ties.of(of.config, of.nodes, self.weights(), of.setting.free if of.setting.prescribed else None, True, self._share)
+        return self.of.ties(self.weights(), self._share)
 
     def weights(self) -> tuple[Ints, Ints, Array]:
         """Indices of contactors, followed global nodes and weights, ``(k,)`` each."""

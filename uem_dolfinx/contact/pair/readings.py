@@ -104,7 +104,7 @@ class Readings:
     @property
     def points(self) -> Array:
         """Current positions of the contactors ``(n, gdim)``."""
-        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
+        return self.config.here(self.nodes)
 
     @property
     def projection(self) -> Projection:

@@ -36,7 +36,7 @@ from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, with_averaged_
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Violations
-from uem_dolfinx.contact.seam.dyads import Terms, grouped
+from uem_dolfinx.contact.seam.dyads import grouped
 from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.placement import ContactRows, Traction
 from uem_dolfinx.contact.seam.state import PairState
@@ -54,10 +54,9 @@ GAP, WORK, BEGUN, RATE, AT = range(5)
 
 def stiffness_of_gaps(pair: Interface, stiffness: Array) -> tuple[Ints, Ints, Array]:
     """Global rows of the gaps with a ``stiffness (n,)``, their contactors, and gradients there, see ``dyads.grouped``."""
-    eq = pair.kinematics.gap_rows.equations
-    row, node = np.append(np.arange(len(eq)), eq.row), np.append(pair.config.to_global(eq.node), eq.followed)
-    gradient = Terms(row, node, np.concatenate([eq.direction, -eq.coefficients]))
-    return grouped(np.append(stiffness, np.zeros(len(eq) - len(stiffness))), gradient, gradient)[:3]
+    rows = pair.kinematics.gap_rows
+    gradients = rows.gradients
+    return grouped(np.append(stiffness, np.zeros(len(rows.equations) - len(stiffness))), gradients, gradients)[:3]
 
 
 class _Edges:

@@ -13,6 +13,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.ends import Ends
 from uem_dolfinx.contact.seam.placement import ContactRows, Kinematics, Setting, Traction, Traits
+from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
@@ -117,6 +118,11 @@ class OnTarget:
             return projection
         offset = self.offset if which is None else self.offset[which]
         return replace(projection, gap=projection.height - offset, offset=offset)
+
+    def ties(self, terms: tuple[Ints, Ints, Array], share: Array) -> Ties:
+        """Relative motion with the weights ``terms`` and the ``share (n,)`` of friction, see ``Ties.of`` (collective)."""
+        free = self.setting.free if self.setting.prescribed else None
+        return Ties.of(self.config, self.nodes, terms, free, self.traits.at_feet, share)
 
     def spread(self, values: Array) -> Array:
         """The shape functions themselves."""

@@ -24,6 +24,7 @@ from uem_dolfinx.geometry.projection import Projection, Target
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.seam.corners import Corners
+    from uem_dolfinx.contact.seam.dyads import Terms
     from uem_dolfinx.contact.seam.ends import Ends
     from uem_dolfinx.contact.seam.relative_motion import Ties
 
@@ -196,6 +197,15 @@ class GapRows:
     def gaps(self, du: Array) -> Array:
         """Deciding gaps ``(n,)`` after an increment of the owned nodes ``(n_owned, gdim)``, to first order (collective)."""
         return np.asarray(self.scale * (self.equations.gap[: len(self.scale)] + self.along(du)))
+
+    @property
+    def gradients(self) -> Terms:
+        """Gradients of the gaps of all equations, as terms of both bodies."""
+        from uem_dolfinx.contact.seam.dyads import Terms
+
+        eq = self.equations
+        row, node = np.append(np.arange(len(eq)), eq.row), np.append(self.config.to_global(eq.node), eq.followed)
+        return Terms(row, node, np.concatenate([eq.direction, -eq.coefficients]))
 
     def forces(self, multipliers: Array) -> tuple[Ints, Array]:
         """Global nodes of both bodies ``(k,)``, and forces there ``(k, gdim)``, of multipliers of all rows ``(m,)``."""

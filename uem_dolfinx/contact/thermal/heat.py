@@ -143,6 +143,9 @@ class Heat:
         InputError, SpaceError: if the field does not exist, or if the target's temperature is missing or given twice.
     """
 
+    #: Numbers of the arguments of h that gaps change; pressures of hard contact are unknowns of their own.
+    _of_gaps: tuple[int, ...] = (1,)
+
     def __init__(self, pair: Pair, law: Conductance, contact: Declared, column: int = 0):
         words, config = f"contact '{pair.name}': heat", pair.config
         if not isinstance(config, ConfigurationAmongFields):
@@ -356,14 +359,14 @@ class Heat:
         found = [(self.conductances() * at.areas, self.jumps())]
         if callable(self.law.h):
             sides = [self._terms(self._of, self._shares(side)) for side in (at.own, at.theirs) if self.law.of_temperatures]
-            found += [self._by_gaps(), *zip(self._slopes(*range(2, 2 + len(sides))), sides)]
+            slopes, n = self._slopes(*self._of_gaps, *range(2, 2 + len(sides))), len(self._of_gaps)
+            found += [self._opening(*slopes[:n]), *zip(slopes[n:], sides)]
         return found
 
-    def _by_gaps(self) -> tuple[Array, Terms]:
-        """Derivatives of the power by open gaps ``(n,)``, and these as linear functions of the unknowns (collective)."""
+    def _opening(self, *slopes: Array) -> tuple[Array, Terms]:
+        """Derivatives of the power by gaps, from its ``slopes`` ``(n,)`` by ``_of_gaps``, and gaps as functions of the unknowns."""
         at, pair = self.passage, self.pair
-        opening = Terms(at.row, at.node, at.jump[:, None] * pair.projection.normal[at.row])
-        return np.where(pair.united, 0.0, self._slopes(1)[0]), opening
+        return np.where(pair.united, 0.0, slopes[0]), Terms(at.row, at.node, at.jump[:, None] * pair.projection.normal[at.row])
 
     def by_pressures(self) -> Array:
         """Derivatives of the power by the pressures of closed contactors ``(n,)`` (collective)."""

@@ -20,6 +20,7 @@ class SoftHeat(Heat):
 
     #: The interface, a ``SoftInterface``.
     pair: Any
+    _of_gaps = (0, 1)
 
     def _state(self) -> tuple[Array, ...]:
         """Pressures and gaps, negative where surfaces overlap, and temperatures (collective)."""
@@ -32,12 +33,9 @@ class SoftHeat(Heat):
         every = np.ones(len(self.pair.nodes), dtype=bool)
         return every, every
 
-    def _by_gaps(self) -> tuple[Array, Terms]:
-        """By gaps at fixed pressures, and through these, along the rows of the gaps (collective)."""
-        by_pressures, by_gaps = self._slopes(0, 1)
+    def _opening(self, *slopes: Array) -> tuple[Array, Terms]:
+        """By gaps at fixed pressures, and through these, along the rows of the gaps."""
+        by_pressures, by_gaps = slopes
         _, slope = self.pair.pressures_at(self.pair.gaps())
-        rows, force = self.pair.kinematics.gap_rows.equations, self.passage.force
-        which = np.append(np.arange(len(rows)), rows.row)
-        gradient = np.concatenate([rows.direction, -rows.coefficients]) / force[which, None]
-        node = np.append(self.pair.config.to_global(rows.node), rows.followed)
-        return by_gaps + by_pressures * slope, Terms(which, node, gradient)
+        of_rows = self.pair.kinematics.gap_rows.gradients
+        return by_gaps + by_pressures * slope, of_rows._replace(vector=of_rows.vector / self.passage.force[of_rows.row, None])

@@ -109,7 +109,7 @@ class Tie:
     @property
     def _points(self) -> Array:
         """Current positions of the contactors ``(n, gdim)``."""
-        return self.config.X[self.nodes] + self.config.displacement[self.nodes]
+        return self.config.here(self.nodes)
 
     def untie(self) -> None:
         """Release all tied contactors; call ``remember`` and ``project`` afterwards."""
