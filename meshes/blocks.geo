@@ -28,8 +28,8 @@ For k In {1 : n_3 ? 3 : 2}
   Else
     // its sides are x = 0, x = 1, y = 0, y = 1, the bottom and the top
     Box(k) = {0, 0, k - 1, 1, 1, 1};
-    side() = Boundary { Volume{k}; };
-    edge() = Boundary { Surface{side()}; };
+    side() = Abs(Boundary { Volume{k}; });
+    edge() = Abs(Boundary { Surface{side()}; });
     Transfinite Curve {edge()} = n(k - 1) + 1;
     Transfinite Surface {side()};
     Transfinite Volume {k};

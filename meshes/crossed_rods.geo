@@ -19,10 +19,10 @@ For k In {1 : 2}
   Rotate {{0, 0, 1}, {0, 0, 0}, (k - 1) * angle} { Volume{k}; }
   Translate {0, 0, (2 * k - 3) * half} { Volume{k}; }
   // the first two faces are the ends
-  face() = Boundary { Volume{k}; };
-  edge() = Boundary { Surface{face()}; };
+  face() = Abs(Boundary { Volume{k}; });
+  edge() = Abs(Boundary { Surface{face()}; });
   Transfinite Curve {edge()} = n(k - 1) + 1;
-  across() = Boundary { Surface{face(0), face(1)}; };
+  across() = Abs(Boundary { Surface{face(0), face(1)}; });
   Transfinite Curve {across()} = m + 1;
   Transfinite Surface {face()};
   Recombine Surface {face()};

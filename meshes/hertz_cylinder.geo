@@ -40,8 +40,10 @@ Line(14) = {10, 11};
 Curve Loop(2) = {11, 12, 13, 14};
 Plane Surface(2) = {2};
 
-Transfinite Curve {4} = Ceil(zone / h_block) + 1;
-Transfinite Curve {11} = Ceil(zone / h_disc) + 1;
+// where all cells are quadrilaterals each curve has an even number
+by = quads ? 2 : 1;
+Transfinite Curve {4} = by * Ceil(zone / h_block / by) + 1;
+Transfinite Curve {11} = by * Ceil(zone / h_disc / by) + 1;
 Field[1] = MathEval;
 Field[1].F = Sprintf("%g + (%g) * 0.5 * (1 + y / (Abs(y) + 1e-9)) + %g * Max(0, Sqrt(x*x + y*y) - %g)",
                      h_block, h_disc - h_block, growth * h, zone);
@@ -52,6 +54,7 @@ Mesh.Algorithm = 6;
 Mesh.ElementOrder = order;
 If (quads)
   Recombine Surface {1, 2};
+  Mesh.RecombinationAlgorithm = 3;
 EndIf
 
 Physical Surface("block") = {1};

@@ -101,7 +101,6 @@ def test_equal_facets(caplog):
         assert warned(caplog) == number
 
 
-@pytest.mark.slow
 def test_held_ends_of_soft_rods(caplog):
     """In general contact, parts have the facets of some faces; held faces make no rigid body."""
     sizes = {"length": 24.0, "n_1": 6, "n_2": 6, "m": 2, "on_edge": 1, "angle": 0.5 * np.pi}

@@ -349,6 +349,20 @@ def test_examples_come_with_the_package():
         uem.example_mesh("hertz_spher")
 
 
+def test_regular_cells_of_the_examples(comm):
+    """All versions of Gmsh make the same cells of volumes by rows, and quadrilaterals alone from an odd number of rows."""
+    rods = {"n_1": 8, "n_2": 6, "m": 2}
+    for name, gdim, sizes, cell, cells in [
+        ("blocks", 3, {"dim": 3, "n_1": 2, "n_2": 3}, "tetrahedron", 6 * (8 + 27)),
+        ("blocks", 3, {"dim": 3, "n_1": 2, "n_2": 3, "quads": 1}, "hexahedron", 8 + 27),
+        ("crossed_rods", 3, rods, "hexahedron", 4 * (8 + 6)),
+        ("hertz_cylinder", 2, {"h": 1 / 30, "quads": 1}, "quadrilateral", None),
+    ]:
+        mesh, _ = read_gmsh(uem.example_mesh(name), comm, gdim, sizes)
+        assert compat.cell_name(mesh) == cell
+        assert cells in (None, mesh.topology.index_map(gdim).size_global)
+
+
 @serial
 def test_gmsh_is_not_called_before_it_is_initialised():
     """Gmsh 4.8 would read there whether errors end the process, from memory that is not set: one in some hundred scripts ended silently."""
