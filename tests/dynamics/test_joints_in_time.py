@@ -45,9 +45,11 @@ class Row:
         own = {} if self.meshed else {"mass": self.m, "inertia": self.inertia}
         return uem.RigidCoupling(self.tags[i], self.at(2.5 * i + 1.0), **own, **how)
 
-    def problem(self, *couplings, law=st_venant, **how):
+    def problem(self, *couplings, law=st_venant, equations=(), **how):
         dynamics = uem.Dynamics(self.mass, gravity=np.array([0.0, -G, 0.0])[: self.g], **how)
-        return uem.UnitedProblem(law(self.u, 1.0), self.u, couplings=list(couplings), dynamics=dynamics, rtol=1e-12), dynamics
+        return uem.UnitedProblem(
+            law(self.u, 1.0), self.u, couplings=list(couplings), equations=equations, dynamics=dynamics, rtol=1e-12
+        ), dynamics
 
     def axis(self):
         return () if self.g == 2 else ((0.0, 0.0, 1.0),)
@@ -87,6 +89,27 @@ def test_a_pendulum(cell, meshed):
     first, second = np.abs(errors)
     assert (second <= [3e-3, 4e-3, 0.8]).all()
     assert (second <= np.array([0.3, 0.3, 0.6]) * first).all()
+
+
+@pytest.mark.parametrize("meshed", [True, False])
+def test_a_pendulum_on_a_cart(meshed):
+    """Equations lead the middle of a bar's end by ``A t^2 / 2``: it falls as in gravity that is oblique, to second order in the step."""
+    from scipy.integrate import solve_ivp
+
+    errors, A = [], 4.0
+    for n in (20, 40):
+        r = Row(meshed=meshed)
+        bar = r.part(0)
+        ends = [[(r.at(0.0, y), 0.5 * np.eye(2)[i]) for y in (0.0, 1.0)] for i in range(2)]
+        cart = [uem.Equation(ends[0], b=lambda t: 0.5 * A * t**2), uem.Equation(ends[1])]
+        problem, _ = r.problem(bar, equations=cart)
+        for step in uem.time_steps(problem, 1.0 / n, 1.0):
+            at = 0.5 * A * step.time**2 + np.cos(bar.rotation) - 1.0
+            assert np.allclose(bar.displacement, (at, np.sin(bar.rotation)), atol=1e-11)
+        by = r.m / (r.inertia + r.m)
+        rates = lambda _, y: (y[1], by * (A * np.sin(y[0]) - G * np.cos(y[0])))  # noqa: E731
+        errors.append(abs(bar.rotation - solve_ivp(rates, (0.0, 1.0), (0.0, 0.0), rtol=1e-11, atol=1e-12).y[0, -1]))
+    assert errors[1] <= 6e-3 and errors[1] <= 0.3 * errors[0]
 
 
 def test_a_double_pendulum():

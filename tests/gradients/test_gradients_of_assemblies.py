@@ -124,6 +124,13 @@ def equation(s, **how):
     return {"contacts": [pressing(s)], "equations": [one]}
 
 
+def relation(s, **how):
+    """Both corners of the rigid top move alike across, up to a given difference: it turns."""
+    jump = constant(s, "b of the equation", 0.02)
+    one = uem.Equation([(place(s, 0.0, 1.0), (0, 1.0)), (place(s, 1.0, 1.0), (0, -1))], b=jump)
+    return coupling(s, equations=[one])
+
+
 def mean(s, **how):
     """The lower side of the upper block has a given mean motion along the contact."""
     return {"contacts": [pressing(s)], "equations": [uem.MeanMotion(s.b.high, (1, 0), b=constant(s, "mean motion", 0.03))]}
@@ -235,6 +242,7 @@ FEATURES = {
     "coupling, hinge": (coupling, {"joints": hinged}, (*FREE, LOADS[1])),
     "coupling, led": (led, {}, (*FREE, *MOTION, "offset")),
     "coupling, led, friction": (led, {"friction": 0.3}, (*FREE, *MOTION)),
+    "coupling, equation": (relation, {}, (*FREE, LOADS[0], "b of the equation")),
     "equation": (equation, {}, (*ALL, "b of the equation", "offset", "X")),
     "mean motion": (mean, {}, (*ALL, "mean motion", "offset")),
     # a slider takes all of a moment

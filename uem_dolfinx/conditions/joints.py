@@ -125,6 +125,12 @@ class Link(given.Sealed, ABC):
             back = np.cross(arm, force) if g == 3 else np.array([arm[0] * force[1] - arm[1] * force[0]])
             self._loads[id(one)] = force, moment - back
 
+    @property
+    def described(self) -> str:
+        """Its name, with the parts that it connects."""
+        ends = " and ".join("the ground" if one is None else f"'{one.name}'" for one in (self.a, self.b))
+        return f"the {self.name} of {ends}"
+
     def load_on(self, one: RigidCoupling) -> tuple[Array, Array] | None:
         """Force ``(gdim,)`` and moment ``(n_turns,)`` of stiffness at the point of a coupling (collective)."""
         self.update()

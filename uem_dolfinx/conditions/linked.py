@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from uem_dolfinx.algebra.rings import DEPENDENT
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.conditions.joints import Joint, Link
+from uem_dolfinx.conditions.relations import Relation
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.conditions.rigid_set import Placement, RigidSets
 from uem_dolfinx.errors import ConflictError
@@ -23,20 +24,34 @@ class Linked:
 
     Args:
         couplings: attached.
-        links: joints and springs, all of whose ends are among the couplings.
+        links: joints, springs and relations, all of whose ends are among the couplings.
         sets: nodes of the couplings.
     """
 
-    def __init__(self, couplings: Sequence[RigidCoupling], links: Sequence[Link], sets: RigidSets):
-        self._couplings, self._links, self._sets = couplings, list(links), sets
-        self.joints = [one for one in links if isinstance(one, Joint)]
-        self.springy = any(one.stiffness for one in links)
+    def __init__(self, couplings: Sequence[RigidCoupling], links: Sequence[Link | Relation], sets: RigidSets):
+        self._couplings, self._links, self._sets = couplings, [one for one in links if isinstance(one, Link)], sets
+        self._relations = [one for one in links if isinstance(one, Relation)]
+        #: All that have equations, relations first.
+        self.joints: list[Joint | Relation] = [*self._relations, *(one for one in self._links if isinstance(one, Joint))]
+        self.springy = any(one.stiffness for one in self._links)
+        #: Number of relations, and mask of the values of all rows that are ramped with the Dirichlet values ``(k,)``.
+        self.n_relations, n_rows = len(self._relations), sum(one.n_rows for one in self.joints)
+        self.ramped = np.append([one.ramped for one in self._relations], np.zeros(n_rows - self.n_relations)).astype(bool)
+
+    def values(self) -> Array:
+        """Present values of all rows ``(k,)``, 0 of joints (collective)."""
+        return np.append([one.wanted for one in self._relations], np.zeros(len(self.ramped) - self.n_relations))
+
+    def values_at(self, places: Sequence[Placement]) -> Array:
+        """Values of the rows in placements of each set ``(k,)``, 0 of joints."""
+        at = self._places(places)
+        return np.append([one.value_at(at) for one in self._relations], np.zeros(len(self.ramped) - self.n_relations))
 
     def _places(self, places: Sequence[Placement]) -> dict[int, Placement]:
         return {id(one): place for one, place in zip(self._couplings, places)}
 
     def rows(self, places: Sequence[Placement]) -> tuple[Array, Array, Array]:
-        """Rows of joints ``(k, n_z)``, their residuals ``(k,)``, and second derivatives ``(k, n_z, n_z)``, 0 with small rotations."""
+        """Rows of joints ``(k, n_z)``, their values ``(k,)``, and second derivatives ``(k, n_z, n_z)``, 0 with small rotations."""
         n, at = len(self._sets.scale), self._places(places)
         found = [(joint, one) for joint in self.joints for one in joint.rows(at)]
         C = np.array([self._by_motions(joint, one.slope) for joint, one in found]).reshape(-1, n)
@@ -45,7 +60,7 @@ class Linked:
             return C, 0.0 * value, np.zeros((len(C), n, n))
         return C, value, np.array([self._by_motions(joint, one.bend) for joint, one in found]).reshape(-1, n, n)
 
-    def _by_motions(self, link: Link, array: Array) -> Array:
+    def _by_motions(self, link: Link | Relation, array: Array) -> Array:
         """A slope ``(12,)`` or second derivatives ``(12, 12)`` of a link by the motions of its ends, by all motions z."""
         out = np.zeros([len(self._sets.scale)] * array.ndim)
         ends = [(self._sets[self._index(one)], columns) for one, columns in link.columns()]
@@ -59,18 +74,21 @@ class Linked:
     def _index(self, coupling: RigidCoupling) -> int:
         return next(i for i, one in enumerate(self._couplings) if one is coupling)
 
-    def closed(self, places: Sequence[Placement], firm: Array) -> list[Placement]:
+    def closed(self, places: Sequence[Placement], wanted: Array, kept: Ints, firm: Array) -> list[Placement]:
         """The nearest placements in which joints are closed, by Newton's method, with finite rotations.
 
         Args:
             places: of each set.
+            wanted: values of the rows ``(k,)``.
+            kept: rows that do not depend on others ``(n_kept,)``.
             firm: rows of scaled motions that do not change ``(k, n_z)``.
         """
         best, now, least, scale = list(places), list(places), np.inf, self._sets.scale
         _, size, axes = np.linalg.svd(firm)
         open_ = axes[np.count_nonzero(size > DEPENDENT) :].T
         for _ in range(MOST_CLOSINGS):
-            C, off, _ = self.rows(now)
+            C, value, _ = self.rows(now)
+            C, off = C[kept], (value - wanted)[kept]
             miss = float(np.abs(off).max(initial=0.0))
             if not miss < least:
                 break
@@ -100,10 +118,9 @@ class Linked:
             own = off[first : first + joint.n_rows]
             first += joint.n_rows
             if (own > bound).any():
-                ends = " and ".join("the ground" if one is None else f"'{one.name}'" for one in (joint.a, joint.b))
                 raise ConflictError(
-                    f"the {joint.name} of {ends} is missed by {own.max():.4g}: no motion satisfies it together with the other joints and "
-                    "prescribed values; give values that agree, or leave one of them out"
+                    f"{joint.described}: missed by {own.max():.4g}, as no motion satisfies it together with the other joints, equations "
+                    "and prescribed values; give values that agree, or leave one of them out"
                 )
 
     def read(self, places: Sequence[Placement], multipliers: Array) -> None:

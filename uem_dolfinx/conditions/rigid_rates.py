@@ -35,7 +35,7 @@ def rates(
     """
     s, g, comm, aim, basis = rows.set, config.gdim, config.comm, rows.aim(), rows.basis
     u, scale, added = config.displacement[: config.n_owned], s.scale, [one.added for one in rows.couplings]
-    V, n_held = s.velocities(aim.at, s.X, s.part), len(aim.part)
+    V, n_held = s.velocities(aim.at, s.X, s.part), len(aim.part) + rows.n_relations
     W = np.zeros_like(V)
     for i, own in enumerate(s.each):
         everywhere = velocities(config.X[: config.n_owned] + u - own.middle - aim.at[i].motion.translation) * own.scale
@@ -53,8 +53,9 @@ def rates(
     G = G / size
     which = np.arange(len(basis.node)), basis.component
     held = np.logical_not(basis.halo.take(free.__getitem__)[which]) & ~massless[basis.part]
-    # without mass of the nodes, the prescribed components follow from the added mass
-    led, C = ~massless[aim.part], aim.C * scale
+    # without mass of the nodes, what is prescribed follows from the added mass
+    C = aim.C * scale
+    led = ~C[:n_held, np.repeat(massless, len(scale) // len(massless))].any(axis=1)
     of_joints = C[n_held:]
     rows_of = np.concatenate([C[:n_held][led], rows.rows_of(basis, aim.at)[held], of_joints])
     k = len(rows_of)
@@ -80,7 +81,7 @@ def rates(
     left = a.copy()
     left[s.nodes] -= bend
     at_points = [None if one is None else one.bend(aim.at[i], z[s[i]][g:]) for i, one in enumerate(added)]
-    ends = -np.einsum("kzy,z,y->k", aim.bends, z, z)
+    ends = -np.einsum("kzy,z,y->k", aim.bends[rows.n_relations :], z, z)
     dz = rigid(left, [None if p is None else one.acceleration - p for one, p in zip(added, at_points)], ends)
     for i, (mass, p) in enumerate(zip(added, at_points)):
         if mass is not None:

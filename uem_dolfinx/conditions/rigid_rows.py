@@ -26,10 +26,12 @@ from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.conditions.joints import Link
 from uem_dolfinx.conditions.linked import Linked
+from uem_dolfinx.conditions.relations import Relation
+from uem_dolfinx.conditions.right_sides import is_ramped
 from uem_dolfinx.conditions.rigid_basis import Basis, chosen
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling, nearest_turn
 from uem_dolfinx.conditions.rigid_set import Placement, RigidSets, moments, turned, velocities
-from uem_dolfinx.conditions.united_rows import CONTRADICTING, is_ramped
+from uem_dolfinx.conditions.united_rows import CONTRADICTING
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion, rotation_matrix
@@ -50,10 +52,10 @@ class Aim:
 
     Attributes:
         at: placement of each set.
-        C: rows of the prescribed motions and, after them, of joints ``(k, n_z)``.
+        C: rows of the prescribed motions and, after them, of equations between parts and of joints ``(k, n_z)``.
         lacking: their residuals ``(k,)``.
         part: set of each prescribed component ``(n_prescribed,)``.
-        bends: second derivatives of the rows of joints ``(k - n_prescribed, n_z, n_z)``.
+        bends: second derivatives of the rows of equations and joints ``(k - n_prescribed, n_z, n_z)``.
     """
 
     at: list[Placement]
@@ -69,7 +71,7 @@ class RigidRows:
     Args:
         config: configuration of the displacement.
         couplings: attached.
-        links: joints and springs, all of whose ends are among the couplings.
+        links: joints, springs and relations, all of whose ends are among the couplings.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
         avoided: mask of owned nodes of contacts, which are preferably eliminated ``(n_owned,)``.
         loaded: Constants that the load sets.
@@ -77,26 +79,31 @@ class RigidRows:
     Attributes:
         equations: of this rank, one for each component of its nodes, with the gaps of the last call of ``at_present``; inactive for
             components in q and for prescribed components.
+        jointed, springy, n_relations: whether rows of joints or relations, and springs, are among the links; number of relations.
     """
 
     def __init__(
         self,
         config: Configuration,
         couplings: Sequence[RigidCoupling],
-        links: Sequence[Link],
+        links: Sequence[Link | Relation],
         free: Bools,
         avoided: Bools,
         loaded: Sequence[fem.Constant],
     ):
         self._config, self.couplings, self.set = config, list(couplings), RigidSets([one.nodes for one in couplings])
         self._linked = Linked(couplings, links, self.set)
+        self.jointed, self.springy, self.n_relations = bool(self._linked.joints), self._linked.springy, self._linked.n_relations
         own = self.set.nodes
         self._free_nodes, self._free, self._avoided = free, free[own], avoided[own]
-        self._ramped = np.array([is_ramped(v, loaded) for one in couplings for v in one.prescribed.values()], dtype=bool)
+        ramped = np.array([is_ramped(v, loaded) for one in couplings for v in one.prescribed.values()], dtype=bool)
+        self._ramped, self._n_prescribed = np.append(ramped, self._linked.ramped), len(ramped)
+        #: Values of the present step; before the first one, equations hold parts where they are.
         self._wanted = self.values()
+        self._wanted[self._n_prescribed :] = self._linked.values_at(self.set.placements(config.displacement[: config.n_owned]))
         self._basis: Basis | None = None
-        #: Displacement at the beginning of the ramp, and its rigid motions.
-        self._start: tuple[Array, list[Array]] | None = None
+        #: Displacement at the beginning of the ramp, its rigid motions, and the values of the rows of links.
+        self._start: tuple[Array, list[Array], Array] | None = None
         #: Rotations there, for a run restarted from a checkpoint ``(n_turns,)``.
         self._began: list[Array | None] = [None] * len(couplings)
         self.at_present()
@@ -104,16 +111,18 @@ class RigidRows:
     # -- steps -------------------------------------------------------------------------------------------------------------
 
     def values(self) -> Array:
-        """Present values of the prescribed components ``(n_prescribed,)`` (collective)."""
-        return np.concatenate([one.wanted() for one in self.couplings])
+        """Present values of the prescribed components and, after them, of the rows of links ``(k,)`` (collective)."""
+        return np.concatenate([*(one.wanted() for one in self.couplings), self._linked.values()])
 
     def begin_step(self, start: Array, fraction: float) -> None:
         """Begin a step at a fraction of a ramp that started at a displacement of the owned nodes ``(n_owned, gdim)`` (collective)."""
         wanted, own = self.values(), start[self.set.nodes]
         if self._start is None or reduced(self._config.comm, int(not np.array_equal(own, self._start[0]))):
             motions = [one.motion_of(start, known) for one, known in zip(self.couplings, self._began)]
-            self._start, self._began = (own.copy(), motions), [None] * len(self.couplings)
-        began = np.concatenate([z[list(one.prescribed)] for one, z in zip(self.couplings, self._start[1])])
+            self._start = own.copy(), motions, self._linked.values_at(self.set.placements(start))
+            self._began = [None] * len(self.couplings)
+        _, motions, of_links = self._start
+        began = np.concatenate([*(z[list(one.prescribed)] for one, z in zip(self.couplings, motions)), of_links])
         self._wanted = np.where(self._ramped, began + fraction * (wanted - began), wanted) if fraction < 1.0 else wanted
         self._basis = None
         self.at_present()
@@ -160,7 +169,8 @@ class RigidRows:
             aim, basis = self.aim(), self.basis
             held = np.logical_not(basis.halo.take(self._free_nodes.__getitem__)[np.arange(len(basis.node)), basis.component])
             firm = np.concatenate([aim.C[: len(aim.part)] * s.scale, self.rows_of(basis, places)[held]])
-            places = self._linked.closed(places, firm)
+            first = self._n_prescribed
+            places = self._linked.closed(places, self._wanted[first:], basis.kept[basis.kept >= first] - first, firm)
         change = s.displacement(places, s.X, s.part) - u[s.nodes]
         self._config.shift(s.nodes, np.where(self._free, change, 0.0))
 
@@ -173,7 +183,7 @@ class RigidRows:
         Raises:
             ConflictError: names the position, or the joint.
         """
-        config, eq, g = self._config, self.at_present(), self._config.gdim
+        config, s, eq, g = self._config, self.set, self.at_present(), self._config.gdim
         here, held = config.displacement[: config.n_owned], iter(self._wanted)
         for one in self.couplings:
             found = one.motion_of(here)
@@ -186,15 +196,16 @@ class RigidRows:
         error = None
         if (misfit > CONTRADICTING * size).any():
             worst = int(np.argmax(misfit.max(axis=1)))
-            name = self.couplings[self.set.part[worst]].name
+            name = self.couplings[s.part[worst]].name
             error = ConflictError(
-                f"the RigidCoupling of '{name}' and a Dirichlet value at {config.describe(int(self.set.nodes[worst]))} "
+                f"the RigidCoupling of '{name}' and a Dirichlet value at {config.describe(int(s.nodes[worst]))} "
                 f"differ by {misfit.max():.4g}: no rigid motion has the prescribed values; give values that agree, or leave conditions out"
             )
         agree(config.comm, error)
-        aim, first = self.aim(), len(self._wanted)
-        # equations of joints that were left out, since they depend on others
-        off = (np.abs(aim.lacking) / self._lengths(aim))[first:]
+        aim, first = self.aim(), self._n_prescribed
+        z = 0.0 if s.large else np.concatenate([one.motion_of(at, here) for one, at in zip(s.each, aim.at)])
+        # equations of links that were left out, since they depend on others
+        off = (np.abs(aim.lacking - (aim.C * z).sum(axis=1)) / self._lengths(aim))[first:]
         self._linked.check(off, CONTRADICTING * max(size, self._config.size))
         self._read(forces)
 
@@ -209,7 +220,7 @@ class RigidRows:
 
     def _read(self, forces: Array) -> None:
         """Reactions of prescribed motions, and forces of joints (collective)."""
-        first, aim, s, g = len(self._wanted), self._linearised, self.set, self._config.gdim
+        first, aim, s, g = self._n_prescribed, self._linearised, self.set, self._config.gdim
         of_joints = self._multipliers(forces)[first:] if self._linked.joints else np.zeros(0)
         work = of_joints @ aim.C[first:]
         for i, one in enumerate(self.couplings):
@@ -241,18 +252,18 @@ class RigidRows:
             rows.append(C[held])
             lacking.append(values - np.append(at.displacement(one.point[None])[0], turn)[held])
             part += [i] * len(held)
-        more, off, bends = self._linked.rows(places)
-        C, residual = np.concatenate([*rows, more]), np.concatenate([*lacking, -off])
+        more, value, bends = self._linked.rows(places)
+        C, residual = np.concatenate([*rows, more]), np.concatenate([*lacking, self._wanted[self._n_prescribed :] - value])
         return Aim(places, C, residual, np.array(part, dtype=np.int64), bends)
 
     def _lengths(self, aim: Aim) -> Array:
         """Lengths of the scaled rows C ``(k,)``."""
-        return np.asarray(np.linalg.norm(aim.C * self.set.scale, axis=1))
+        size = np.linalg.norm(aim.C * self.set.scale, axis=1)
+        return np.where(size > 0.0, size, 1.0)
 
     def at_present(self) -> UnitingEquations:
         """The equations, linearised at the present displacement and with its gaps (collective)."""
-        s, config, g = self.set, self._config, self._config.gdim
-        aim = self.aim()
+        s, config, g, aim = self.set, self._config, self._config.gdim, self.aim()
         lengths = self._lengths(aim)[:, None]
         C, lacking = aim.C * s.scale / lengths, aim.lacking / lengths[:, 0]
         basis = self._basis_for(aim.at, C)
@@ -276,21 +287,10 @@ class RigidRows:
         return self.equations
 
     def opened(self, change: Array, share: float) -> Array:
-        """As for ``UnitedRows``, with prescribed components ``(n_prescribed,)`` (collective)."""
+        """As for ``UnitedRows``, with the values of all rows ``(k,)`` (collective)."""
         aim, basis, s = self._linearised, self.basis, self.set
-        own = np.where(self._ramped & (change != 0.0), share, 1.0) * change
-        lacking = (np.append(own, np.zeros(len(aim.C) - len(own))) / self._lengths(aim))[basis.kept]
+        lacking = (np.where(self._ramped & (change != 0.0), share, 1.0) * change / self._lengths(aim))[basis.kept]
         return -(s.velocities(aim.at, s.X, s.part) @ (self._inverse[:, len(basis.node) :] @ lacking)).ravel()
-
-    @property
-    def jointed(self) -> bool:
-        """Whether joints are among its links."""
-        return bool(self._linked.joints)
-
-    @property
-    def springy(self) -> bool:
-        """Whether springs are among its links."""
-        return self._linked.springy
 
     @property
     def eliminated(self) -> Bools:
@@ -341,7 +341,7 @@ class RigidRows:
         s, config, g, aim = self.set, self._config, self._config.gdim, self._linearised
         if not s.large or self._basis is None or not len(self._basis.node):
             return None
-        G, first = np.zeros((len(s.scale), len(s.scale))), len(self._wanted)
+        G, first = np.zeros((len(s.scale), len(s.scale))), self._n_prescribed
         found = self._multipliers(forces)[first:] if self._linked.joints else np.zeros(0)
         # forces on each body that act elsewhere than at its point
         elsewhere = found @ aim.C[first:]

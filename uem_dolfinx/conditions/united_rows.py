@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-from dolfinx import fem
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.conditions.equation import GivenRows, LinearEquations, rows_of, values_of
+from uem_dolfinx.conditions.equation import GivenRows
 from uem_dolfinx.conditions.independent_rows import Solved, divided, eliminated, singles, sizes
+from uem_dolfinx.conditions.right_sides import RightSides
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
-from uem_dolfinx.parallel import Exchange, agree, agreed, ask_together, reduced
+from uem_dolfinx.parallel import Exchange, agree, reduced
 
 #: Equations that were left out because they follow from others hold up to this part of the displacements and values in them.
 #: [convention; displacements and values; test_equation.py::test_what_contradicts]
@@ -30,13 +29,14 @@ class UnitedRows:
 
     Args:
         config: configuration of the displacement.
-        declared: the equations as users declared them.
+        sides: right-hand sides.
+        rows: this rank's equations, with values numbered as in ``sides``.
+        item: number of the declaration of each ``(m,)``.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
         contactors: mask of owned nodes of contacts, which are eliminated only if no other node can be ``(n_owned,)``.
-        loaded: Constants that the load sets; other values are ramped with the Dirichlet values.
-        at: load factor or time of the first evaluation of functions.
 
     Attributes:
+        sides: right-hand sides.
         equations: of this rank, with the gaps of the last call of ``at_present``.
 
     Raises:
@@ -46,35 +46,27 @@ class UnitedRows:
     def __init__(
         self,
         config: Configuration,
-        declared: Sequence[LinearEquations],
+        sides: RightSides,
+        rows: GivenRows,
+        item: Ints,
         free: Bools,
         contactors: Bools,
-        loaded: Collection[fem.Constant] = (),
-        at: float = 0.0,
     ):
-        self._config, self._declared = config, list(declared)
-        counts = [one.n_values(config.block) for one in self._declared]
-        self._n_values = sum(counts)
-        self._evaluated: list[Any] = [None] * len(counts)
-        ramped = [is_ramped(one.b, loaded) for one in self._declared]
-        self._make(np.cumsum([0, *counts]), free, contactors)
+        self._config, self.sides = config, sides
+        self._make(rows, item, free, contactors)
         self._halo = Halo(config, self.equations.followed)
         left = self._left
         self._left_halo = Halo(config, left.node)
-        every = np.repeat(ramped, counts)
+        every = sides.ramped
         #: Mask of rows whose values are ramped with the Dirichlet values, and the same for the equations that were left out.
         self._ramped = np.asarray(self._weights[:, ~every].getnnz(axis=1) == 0), every[left.value]
         #: Left-hand sides at the beginning of the ramp, of rows and of equations left out, and the fraction of the ramp.
         self._start, self._fraction = (np.zeros(len(self.equations)), np.zeros(len(left))), 1.0
-        self.take_load(at)
         self._wanted = self.values()
 
-    def _make(self, first: Ints, free: Bools, contactors: Bools) -> None:
+    def _make(self, rows: GivenRows, item: Ints, free: Bools, contactors: Bools) -> None:
         """Choose the component that each equation eliminates (collective)."""
         config = self._config
-        parts = config.seams.given if config.seams else rows_of(config, self._declared)
-        item = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
-        rows = GivenRows.join([replace(p, value=p.value + f) for p, f in zip(parts, first)])
         size = sizes(config, rows, free)
         able = np.zeros(len(rows), dtype=bool)
         able[rows.row[(size > 0).any(axis=1)]] = True
@@ -98,7 +90,7 @@ class UnitedRows:
 
     def _refuse(self, rows: GivenRows, item: Ints, which: Bools, words: str) -> None:
         """Raise a ConflictError with ``words`` if any of these rows belongs to a firm equation (collective)."""
-        firm = np.array([one.firm for one in self._declared], dtype=bool)
+        firm = np.array([one.firm for one in self.sides.declared], dtype=bool)
         bad, error = np.flatnonzero(which & firm[item]), None
         X = self._config.ask_owners(rows.node, self._config.X[: self._config.n_owned])
         if len(bad):
@@ -136,31 +128,15 @@ class UnitedRows:
         self.equations = UnitingEquations(
             node, np.eye(g)[pivot % g], np.zeros(m), np.ones(m, dtype=bool), terms[:, 0], terms[:, 1], coefficients
         )
-        self._weights = csr_matrix((weight, (weight_row, value)), shape=(m, self._n_values))
+        self._weights = csr_matrix((weight, (weight_row, value)), shape=(m, len(self.sides.ramped)))
         #: Size of the gaps for displacements of size one.
         self._size = 1.0 + np.bincount(terms[:, 0], np.abs(coefficients).sum(axis=1), m)
 
     # -- right-hand sides ------------------------------------------------------------------------------------------------
 
-    def take_load(self, at: float) -> None:
-        """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
-        for i, one in enumerate(self._declared):
-            if callable(one.b) and not isinstance(one.b, fem.Constant):
-                self._evaluated[i] = ask_together(self._config.comm, f"the value of equations[{i}] at {at:.6g}", one.b, at)
-
-    def given_values(self) -> dict[str, Any]:
-        """Present right-hand sides, by name."""
-        now = [one.b if known is None else known for one, known in zip(self._declared, self._evaluated)]
-        return {f"the value of equations[{i}]": value for i, value in enumerate(now)}
-
     def values(self) -> Array:
         """Present right-hand sides ``(n_values,)`` (collective)."""
-        with agreed(self._config.comm):
-            found = [
-                values_of(f"the value of equations[{i}]", one.b if known is None else known, one.n_values(self._config.block))
-                for i, (one, known) in enumerate(zip(self._declared, self._evaluated))
-            ]
-        return np.concatenate(found)
+        return self.sides.values()
 
     def begin_step(self, start: Array, fraction: float) -> None:
         """Begin a step at a fraction of a ramp that started at a displacement of the owned nodes ``(n_owned, gdim)`` (collective)."""
@@ -234,10 +210,3 @@ class UnitedRows:
 def forces_of(config: Configuration, eq: UnitingEquations, multipliers: Array) -> Array:
     """Forces of equations by their multipliers ``(m,)`` at the owned nodes ``(n_owned, gdim)`` (collective)."""
     return config.add_at_owners(np.concatenate([config.to_global(eq.node), eq.followed]), eq.forces(multipliers))
-
-
-def is_ramped(b: Any, loaded: Collection[fem.Constant]) -> bool:
-    """Whether a right-hand side is ramped with the Dirichlet values; functions and ``loaded`` Constants are not."""
-    if isinstance(b, fem.Constant):
-        return not any(b is constant for constant in loaded)
-    return not callable(b)

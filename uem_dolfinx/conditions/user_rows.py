@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
@@ -11,7 +12,10 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.conditions.equation import GivenRows, rows_of
 from uem_dolfinx.conditions.joints import Link
+from uem_dolfinx.conditions.relations import Relation, relations_of
+from uem_dolfinx.conditions.right_sides import RightSides
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.conditions.rigid_rates import rates
 from uem_dolfinx.conditions.rigid_rows import RigidRows
@@ -108,13 +112,13 @@ class UserRows:
     def take_load(self, at: float) -> None:
         """Evaluate functions at a load factor or time (collective)."""
         if self.linear is not None:
-            self.linear.take_load(at)
+            self.linear.sides.take_load(at)
         for one in self._couplings:
             one.take_load(at)
 
     def given_values(self) -> dict[str, Any]:
         """Present right-hand sides of linear equations, by name."""
-        return {} if self.linear is None else self.linear.given_values()
+        return {} if self.linear is None else self.linear.sides.by_name()
 
     def begin_step(self, start: Array, fraction: float) -> None:
         """Begin a step at a fraction of a ramp that started at a displacement ``(n_owned, gdim)`` (collective)."""
@@ -236,22 +240,35 @@ def rows_of_users(
         one.take_load(at)
         if not one.distribute:
             _refuse_shared(one, taken)
-    for some, links in connected(couplings):
-        rigid.append(RigidRows(config, some, links, free, avoided, loaded))
     # linear equations do not eliminate components of couplings
-    left = free & ~taken[:, None]
-    linear = UnitedRows(config, equations, left, avoided, loaded, at) if equations else None
+    linear, relations, left = None, list[Relation](), free & ~taken[:, None]
+    if equations:
+        sides = RightSides(config, equations, loaded, at)
+        parts = config.seams.given if config.seams else rows_of(config, equations)
+        item = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+        rows = GivenRows.join([replace(p, value=p.value + f) for p, f in zip(parts, sides.first)])
+        if stiff := [one for one in couplings if not one.distribute]:
+            among, relations = relations_of(config, rows, item, sides, stiff, left)
+            rows, item = rows.select(~among), item[~among]
+        linear = UnitedRows(config, sides, rows, item, left, avoided)
+    for some, links in connected(couplings, relations):
+        rigid.append(RigidRows(config, some, links, free, avoided, loaded))
     return UserRows(config, linear, rigid, couplings, free)
 
 
-def connected(couplings: Sequence[RigidCoupling]) -> list[tuple[list[RigidCoupling], list[Link]]]:
-    """Groups of couplings that joints or springs connect, with these; couplings without are groups of one."""
+def connected(
+    couplings: Sequence[RigidCoupling], relations: Sequence[Relation] = ()
+) -> list[tuple[list[RigidCoupling], list[Link | Relation]]]:
+    """Groups of couplings that joints, springs or relations connect, with these; couplings without are groups of one."""
     left, groups = [one for one in couplings if not one.distribute], []
     while left:
-        group, links = [left.pop(0)], dict[int, Link]()
+        group, links = [left.pop(0)], dict[int, Link | Relation]()
         for one in group:
-            links |= {id(link): link for link in one.links}
-            group += [end for link in one.links for end in link.ends if not any(end is other for other in group)]
+            own = [*one.links, *(link for link in relations if any(end is one for end in link.ends))]
+            links |= {id(link): link for link in own}
+            # several links may have the same ends
+            ends = {id(end): end for link in own for end in link.ends}
+            group += [end for end in ends.values() if not any(end is other for other in group)]
         left = [one for one in left if not any(one is other for other in group)]
         groups.append((group, list(links.values())))
     return groups
