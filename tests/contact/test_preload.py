@@ -201,6 +201,19 @@ def test_energy_in_motion():
     assert min(openings) == pytest.approx(-2 * 0.02 / M * 1.5, rel=0.2) and max(openings) < 0.0
 
 
+def test_shortened_in_motion():
+    """A section that is shortened in time does work as a tool does: no step is cut for it, and the energy book closes."""
+    b = blocks(COMM, "quadrilateral", 2, 4, degree=1)
+    bolt = uem.Preload(b.high, b.low, shortening=lambda t: 0.03 * np.sin(0.5 * np.pi * t) ** 2)
+    F, dynamics = linear(b.u, modulus(b.scene, 1.0, 2.0)), uem.Dynamics(uem.lumped_mass(b.V, 1.0))
+    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.0), contacts=[bolt], dynamics=dynamics)
+    book = uem.EnergyBook(problem, 0.5 * ufl.replace(F, {F.arguments()[0]: b.u}))
+    for n, step in enumerate(uem.time_steps(problem, 0.1, 1.0), 1):
+        row = book.write(step)
+        assert step.number == n and step.cuts == 0 and bolt.opening == pytest.approx(-0.03 * np.sin(0.05 * np.pi * n) ** 2)
+    assert row.contact > 1e-4 and abs(row.defect) <= 1e-12
+
+
 def test_what_is_refused():
     b = blocks(COMM, "triangle", 1, 1)
     E = modulus(b.scene, 1.0, 1.0)

@@ -205,8 +205,8 @@ class Preloaded(Tie):
 
     @property
     def works(self) -> bool:
-        """See ``Tie``; True while the opening is free."""
-        return not self.locked
+        """See ``Tie``; True while the opening is free or prescribed."""
+        return not self.locked or self.shortened
 
     def applied_forces(self, force: float | None = None) -> tuple[Ints, Array] | None:
         """See ``Readings``; the pair of forces on the faces, by default the given one, while the opening is free (collective)."""
