@@ -43,4 +43,4 @@ def test_who_has_rows():
     for reach, rows in ((-1.0, 0), (0.1, 1), (0.3, 5), (0.6, 5)):
         pair.trial = replace(pair.trial, active=x < reach)
         assert COMM.allreduce(len(pair.equations().contactor)) == rows
-        assert (pair.reserved | ~pair.trial.active).all()
+        assert (pair.trial.reserved | ~pair.trial.active).all()

@@ -28,7 +28,7 @@ def switch_off(pair: Interface) -> None:
     """Open a pair permanently; accumulated slip, wear and dissipation are kept (collective)."""
     if pair.tie is not None:
         pair.tie.untie()
-    n, g, f, none = len(pair.nodes), pair.config.gdim, pair.committed.friction, np.zeros(len(pair.nodes), dtype=bool)
+    n, g, f = len(pair.nodes), pair.config.gdim, pair.committed.friction
     state = PairState.initial(n, g)
     if f is not None:
         fresh = FrictionState.initial(n, g)
@@ -37,7 +37,7 @@ def switch_off(pair: Interface) -> None:
     for name in ("bond", "heat"):
         if getattr(pair.committed, name) is not None:
             state = replace(state, **{name: np.zeros_like(getattr(pair.committed, name))})
-    settle(pair, (state, none, none))
+    settle(pair, state)
 
 
 def switch_on(pair: Interface) -> None:
@@ -101,9 +101,9 @@ def _refuse_at_ties(tie: Tie, changed: Bools) -> None:
     agree(config.comm, error)
 
 
-def settle(pair: Interface, memory: Any = None) -> None:
-    """Place the committed state, or one from ``Interface.memory``, with the present conditions and offsets (collective)."""
-    pair.remember(pair.memory() if memory is None else memory)
+def settle(pair: Interface, state: PairState | None = None) -> None:
+    """Place the committed state, or another, with the present conditions and offsets (collective)."""
+    pair.remember(state or pair.committed)
     pair.project()
 
 

@@ -50,7 +50,7 @@ class AnchorSlopes:
         active = self._sliding.active(state)
         assert state.friction is not None
         held = self._sliding.frame.free_tangents.any(axis=(1, 2))
-        self.stuck: Bools = active & state.friction.stick & ~pair.redundant & held
+        self.stuck: Bools = active & state.friction.stick & ~state.redundant & held
         self._slips = self._sliding.slipping(state)
         self._anchor, friction = self._tangents_at_anchors(), self._sliding
         at_edges = self._slips & (pair.kinematics.pressure_map(False).force != pair.kinematics.ties.share)

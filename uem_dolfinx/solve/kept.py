@@ -66,7 +66,7 @@ def state_of(problem: Any) -> State:
             problem.u.x.array[:] = config.values_of(own)
             for pair in problem.interfaces:
                 # they were projected at the previous positions of the bodies
-                pair.remember(pair.memory())
+                pair.remember(pair.committed)
                 pair.project()
         problem.committed, problem.motions = np.array(problem.u.x.array), problem.rigid_motions()
         problem.largest_forces = np.asarray(state.numbers["largest forces"])[()]

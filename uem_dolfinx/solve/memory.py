@@ -10,6 +10,7 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError, UEMError, UserFunctionError
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.parallel import agreed
@@ -34,7 +35,7 @@ class Memory:
     displacement: Array
     largest_forces: float
     motions: list[Motion | None]
-    pairs: list[Any]
+    pairs: list[PairState]
     histories: list[dict[str, Array]]
     stiffness: Array | None
     dynamics: Any
@@ -46,7 +47,7 @@ class Memory:
             displacement=problem.committed,
             largest_forces=problem.largest_forces,
             motions=problem.motions,
-            pairs=[pair.memory() for pair in problem.interfaces],
+            pairs=[pair.committed for pair in problem.interfaces],
             histories=[{name: np.array(f.x.array) for name, f in m.history.items()} for m in problem.materials],
             stiffness=problem.bodies.stiffness_at_start,
             dynamics=None if problem.dynamics is None else problem.dynamics.memory(),

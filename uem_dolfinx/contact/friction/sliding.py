@@ -143,11 +143,11 @@ class Sliding:
             self._directed = found = *of, self.frame.directions(of[1])
         return found[2]
 
-    def distances(self, state: PairState, redundant: Bools) -> Array:
+    def distances(self, state: PairState) -> Array:
         """Distances of sticking contactors from their anchors, zero for others, lengths ``(n,)``."""
         held = np.where(self.left_out[:, :, None], 0.0, self.frame.free_tangents)
         away = np.linalg.norm(stick_slip.along(held, self.frame.away), axis=1)
-        return np.where(self.active(state) & _of(state).stick & ~redundant, away, 0.0)
+        return np.where(self.active(state) & _of(state).stick & ~state.redundant, away, 0.0)
 
     def return_vectors(self, state: PairState) -> Array:
         """Tangential displacements that return sticking contactors to their anchors ``(n, gdim)``."""

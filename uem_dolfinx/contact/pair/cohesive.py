@@ -226,9 +226,9 @@ class CohesiveInterface(SofteningInterface):
         self._first = None
         self._branch, self._changes = np.zeros(0, np.int64), np.zeros(len(self.nodes), np.int64)
 
-    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
+    def remember(self, state: PairState) -> None:
         """See ``Interface``."""
-        super().remember(memory)
+        super().remember(state)
         self._first = None
         if self.friction is not None:
             self.friction.set(self.friction.limits.law, self._rubbing(self._mu))

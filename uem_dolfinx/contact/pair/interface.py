@@ -54,8 +54,6 @@ class Interface(Readings):
         committed: state of the last step.
         kinematics: of the contactors, for the trial state; available after ``project``.
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
-        redundant: active contactors whose equations depend on others and were left out ``(n,)``.
-        reserved: contactors that have rows in the sparsity of P ``(n,)``.
         mutual: whether contactors and target follow each other (two-pass).
         heats: heat flow, one object per conductance.
     """
@@ -81,8 +79,6 @@ class Interface(Readings):
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
         self.trial = self.committed = replace(state, friction=along, bond=bond)
         self.heats: list[Heat] = []
-        none: Bools = np.zeros(n, dtype=bool)
-        self.redundant = self.reserved = self._redundant = self._reserved = none
         self.initial_overlap, self.mutual = 0.0, False
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
@@ -215,7 +211,7 @@ class Interface(Readings):
         if swept and self.thickness < np.inf:
             off = off | (self.trial.at_end & self.trial.passed)
         # a contactor is open if its equation was dropped as redundant and its gap is positive
-        apart = self.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
+        apart = self.trial.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
         # ``follow`` releases the facets of a corner one by one
         pulled = np.where(self.trial.in_corner, 0.0, seen.lam)
         rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
@@ -297,11 +293,12 @@ class Interface(Readings):
 
         Contactors near the target have rows; this set is renewed when an active contactor has no row. At first touch, it is the active set.
         """
-        lacks, known = reduced(self.config.comm, np.array([(self.trial.active > self.reserved).sum(), self.reserved.sum()]))
+        active, reserved = self.trial.active, self.trial.reserved
+        lacks, known = reduced(self.config.comm, np.array([(active > reserved).sum(), reserved.sum()]))
         if lacks:
             near = self.kinematics.ends.near(self.trial, self.max_penetration)
-            self.reserved = near & ~self.tied if known else self.trial.active.copy()
-        own = self.kinematics.gap_rows.select(np.flatnonzero(self.reserved), self.trial.active)
+            self.trial = replace(self.trial, reserved=near & ~self.tied if known else active)
+        own = self.kinematics.gap_rows.select(np.flatnonzero(self.trial.reserved), active)
         if self.friction is not None:
             own = self.friction.equations(own, self.trial, self.kinematics)
         return own if self.tie is None else self.tie.join(own)
@@ -310,8 +307,9 @@ class Interface(Readings):
         """Set which of the equations ``(m,)`` are redundant and were dropped."""
         if self.tie is not None:
             self.tie.set_redundant(equations, redundant)
-        self.redundant = np.zeros(len(self.nodes), dtype=bool)
-        self.redundant[equations.contactor[equations.normal]] = redundant[equations.normal]
+        along = np.zeros(len(self.nodes), dtype=bool)
+        along[equations.contactor[equations.normal]] = redundant[equations.normal]
+        self.trial = replace(self.trial, redundant=along)
         if self.friction is not None:
             self.friction.set_redundant(equations, redundant)
 
@@ -365,7 +363,6 @@ class Interface(Readings):
         """Tie contactors to the target permanently, between two steps, see ``Tie``; call ``project`` afterwards (collective)."""
         assert self.tie is not None
         self.committed = self.tie.unite(self.committed, self.projection, self._past_end, which)
-        self._reserved, self._redundant = self.reserved & ~self.tied, self.redundant
         self.restore()
 
     def commit(self) -> None:
@@ -379,10 +376,9 @@ class Interface(Readings):
         inside = self.projection.gap < 0
         self.trial = replace(self.trial, barred=self.trial.barred & inside)
         passed = self.off | (self.trial.passed & inside)
-        fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed)
+        reserved = self.trial.reserved & bool(self.trial.active.any())
+        fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed, reserved=reserved)
         self.committed = replace(fresh, at_end=self._at_end(fresh))
-        self.reserved = self.reserved & bool(fresh.active.any())
-        self._reserved, self._redundant = self.reserved, self.redundant
         self.restore()
         self.discretisation.commit()
         self._wear()
@@ -395,21 +391,13 @@ class Interface(Readings):
     def restore(self) -> None:
         """Go back to the committed state; call ``project`` afterwards."""
         self.trial = self.committed
-        self.reserved, self.redundant = self._reserved, self._redundant
         if self.tie is not None:
             self.tie.lose()
 
-    def memory(self) -> tuple[PairState, Bools, Bools]:
-        """The state with which the next step begins, without the displacement."""
-        return self.committed, self.reserved, self.redundant
-
-    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
-        """Restore a state from ``memory``; call ``project`` afterwards, with bodies and target at their positions of that time."""
-        self.committed, self.reserved, self.redundant = memory
-        if self.tie is not None:
-            # contactors that have been tied since then remain tied
-            self.committed, self.reserved = self.tie.untouched(self.committed), self.reserved & ~self.tied
-        self._reserved, self._redundant = self.reserved, self.redundant
+    def remember(self, state: PairState) -> None:
+        """Return to a committed state; call ``project`` afterwards, with bodies and target at their positions of that time."""
+        # contactors that have been tied since then remain tied
+        self.committed = state if self.tie is None else self.tie.untouched(state)
         self.discretisation.commit()
         if self.friction is not None:
             self.friction.forget()
@@ -420,8 +408,7 @@ class Interface(Readings):
         """Restore a state from ``to_checkpoint``; call ``project`` afterwards (collective)."""
         if self.tie is not None:
             self.tie.from_checkpoint(kept, self._past_end)
-        reserved, redundant = (np.array(kept[name]) for name in ("reserved", "redundant"))
-        self.remember((PairState.from_checkpoint(kept, self.target.facets_of), reserved, redundant))
+        self.remember(PairState.from_checkpoint(kept, self.target.facets_of))
 
 
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:

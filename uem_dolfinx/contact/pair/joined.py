@@ -55,8 +55,6 @@ class JoinedInterface(Interface):
         facets, surface = nodal.target.facets, nodal.surface_of
         parts = [renumbered(p.committed, lambda f, s=s: facets.here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
         self.trial = self.committed = joined(parts)
-        self.reserved, self.redundant = (np.concatenate([getattr(p, k) for p in own]) for k in ("reserved", "redundant"))
-        self._reserved, self._redundant = self.reserved, self.redundant
 
     @property
     def members(self) -> Sequence[Interface]:
@@ -111,10 +109,10 @@ class JoinedInterface(Interface):
         if far.any():
             self.trial = self.committed = with_rows(self.committed, far, rows(before, far))
 
-    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
-        """Restore a state from ``memory``; call ``project`` afterwards, with bodies and target at their positions of that time."""
+    def remember(self, state: PairState) -> None:
+        """See ``Interface``; no contact is skipped."""
         self.discretisation.far = False
-        super().remember(memory)
+        super().remember(state)
 
     def part(self) -> list[Interface]:
         """The separate interfaces of the contacts, in their committed states; call ``project`` afterwards (collective)."""
@@ -122,11 +120,6 @@ class JoinedInterface(Interface):
             if pair.friction is not None:
                 pair.friction.free = self.discretisation.free[self.rows_of[k]]
             pair.initial_overlap, pair.mutual = member.initial_overlap, member.mutual
-            pair.remember(self.memory_of(k, self.memory()))
+            pair.remember(self.state_of(k, self.committed))
             pair.trial = self.state_of(k, self.trial)
         return self.own
-
-    def memory_of(self, k: int, memory: tuple[PairState, Bools, Bools]) -> tuple[PairState, Bools, Bools]:
-        """A contact's part of the result of ``memory``."""
-        reserved, redundant = (a[self.rows_of[k]] for a in memory[1:])
-        return self.state_of(k, memory[0]), reserved, redundant

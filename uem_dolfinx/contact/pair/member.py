@@ -18,18 +18,6 @@ from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.projection import FacetProjection
 
 
-def _rows_of(name: str) -> Any:
-    """Property for a member's rows of an array of the joint interface."""
-
-    def get(member: Member) -> Any:
-        return getattr(member.joined, name)[member._rows]
-
-    def put(member: Member, value: Any) -> None:
-        member._set(name, value)
-
-    return property(get, put)
-
-
 class Member(Interface):
     """One contact of a ``JoinedInterface`` as a separate interface, with its rows of states and its own numbers of facets.
 
@@ -71,17 +59,6 @@ class Member(Interface):
     def committed(self, state: PairState) -> None:
         self.joined.committed = self.joined.with_state_of(self._k, self.joined.committed, state)
 
-    def _set(self, name: str, value: Any) -> None:
-        every = getattr(self.joined, name).copy()
-        every[self._rows] = value
-        setattr(self.joined, name, every)
-
-    #: See ``Interface``; rows of the joint arrays ``(n,)``.
-    reserved = _rows_of("reserved")
-    redundant = _rows_of("redundant")
-    _reserved = _rows_of("_reserved")
-    _redundant = _rows_of("_redundant")
-
     @property
     def mutual(self) -> bool:  # type: ignore[override]
         """Whether contactor and target of this contact follow each other."""
@@ -90,7 +67,7 @@ class Member(Interface):
     @mutual.setter
     def mutual(self, value: bool) -> None:
         self.joined.mutual_of[self._k] = value
-        self._set("mutual", value)
+        self.joined.mutual = self.joined.mutual_of[self.joined.label]
 
     @property
     def united(self) -> Bools:
@@ -100,10 +77,10 @@ class Member(Interface):
     def largest_gap_here(self) -> float:
         """Largest gap of an active contactor of this rank, or distance from its anchor, a length."""
         whole = self.joined
-        here = float(np.abs(self.gap[self.united & ~self.redundant]).max(initial=0.0))
+        here = float(np.abs(self.gap[self.united & ~whole.trial.redundant[self._rows]]).max(initial=0.0))
         if whole.friction is None:
             return here
-        return max(here, float(whole.friction.distances(whole.trial, whole.redundant)[self._rows].max(initial=0.0)))
+        return max(here, float(whole.friction.distances(whole.trial)[self._rows].max(initial=0.0)))
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
 
@@ -161,10 +138,10 @@ class Member(Interface):
 
     # -- changes between steps -------------------------------------------------------------------------------------------
 
-    def remember(self, memory: tuple[PairState, Bools, Bools]) -> None:
-        """Restore a state from ``memory``; call ``project`` afterwards, with bodies and target at their positions of that time."""
+    def remember(self, state: PairState) -> None:
+        """See ``Interface``; the contact is not skipped."""
         self.far = False
-        super().remember(memory)
+        super().remember(state)
 
     def set_offset(self, offset: Array | None) -> None:
         """Set offsets ``(n,)``; contactors must be placed again (collective)."""

@@ -31,8 +31,6 @@ class Readings:
     friction: Sliding | None
     tie: Tie | None
     committed: PairState
-    reserved: Bools
-    redundant: Bools
     kinematics: Kinematics
     discretisation: Discretisation
 
@@ -149,9 +147,9 @@ class Readings:
 
     def largest_gap_here(self) -> float:
         """Largest gap of an active contactor of this rank, or distance from its anchor or tied position, a length."""
-        here = float(np.abs(self.gap[self.trial.active & ~self.redundant]).max(initial=0.0))
+        here = float(np.abs(self.gap[self.trial.active & ~self.trial.redundant]).max(initial=0.0))
         if self.friction is not None:
-            here = max(here, float(self.friction.distances(self.trial, self.redundant).max(initial=0.0)))
+            here = max(here, float(self.friction.distances(self.trial).max(initial=0.0)))
         return here if self.tie is None else max(here, self.tie.largest_gap_here())
 
     @property
@@ -200,6 +198,5 @@ class Readings:
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays ``(n, ...)`` for checkpoints, with facets as keys independent of the partition (collective)."""
-        kept: dict[str, npt.NDArray[Any]] = {"reserved": self.reserved, "redundant": self.redundant}
-        kept |= self.committed.to_checkpoint(self.target.keys_of)
+        kept = self.committed.to_checkpoint(self.target.keys_of)
         return kept if self.tie is None else kept | self.tie.to_checkpoint()

@@ -69,6 +69,8 @@ class PairState:
     """State of ``n`` contactors; immutable, so that trial and committed states may share arrays.
 
     Attributes:
+        reserved: whether it has rows in the sparsity of P ``(n,)``.
+        redundant: whether its equation depends on others and was left out ``(n,)``.
         active: whether the contact equation is active ``(n,)``.
         lam: normal contact force, positive in compression ``(n,)``; on a degree-2 surface the control force.
         nodal: normal contact force at the node ``(n,)``; equal to ``lam`` on a degree-1 surface.
@@ -95,6 +97,8 @@ class PairState:
         wet: whether a fluid between the surfaces reaches the contactor ``(n,)``; None without fluid.
     """
 
+    reserved: Bools
+    redundant: Bools
     active: Bools
     lam: Array
     nodal: Array
@@ -128,6 +132,8 @@ class PairState:
     def initial(cls, n: int, gdim: int) -> PairState:
         """The state of ``n`` contactors that nothing is known about."""
         return cls(
+            reserved=np.zeros(n, bool),
+            redundant=np.zeros(n, bool),
             active=np.zeros(n, bool),
             lam=np.zeros(n),
             nodal=np.zeros(n),

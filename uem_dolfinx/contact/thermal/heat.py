@@ -55,7 +55,6 @@ class Pair(Protocol):
     kinematics: Kinematics
     discretisation: Discretisation
     friction: Sliding | None
-    reserved: Bools
 
     @property
     def asked(self) -> bool:
@@ -187,7 +186,7 @@ class Heat:
     def equations(self) -> HeatEquations:
         """Equations for temperatures of touching contactors; contactors that may touch have inactive equations (collective)."""
         pair, at, g = self.pair, self.passage, self.pair.config.gdim
-        which = np.flatnonzero((pair.united | pair.reserved) & at.leads)
+        which = np.flatnonzero((pair.united | pair.trial.reserved) & at.leads)
         place = np.full(len(pair.nodes), -1, dtype=np.int64)
         place[which] = np.arange(len(which))
         known: Any = at.halo.take(self.field.terms)

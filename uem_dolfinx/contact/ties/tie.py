@@ -160,7 +160,7 @@ class Tie:
         if f is not None:
             f = replace(f, stick=f.stick & ~tied, tau=np.where(tied[:, None], 0.0, f.tau))
         lam, nodal = (np.where(tied, 0.0, force) for force in (state.lam, state.nodal))
-        return replace(state, active=state.active & ~tied, lam=lam, nodal=nodal, friction=f)
+        return replace(state, active=state.active & ~tied, reserved=state.reserved & ~tied, lam=lam, nodal=nodal, friction=f)
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
 

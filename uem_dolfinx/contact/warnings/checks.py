@@ -83,7 +83,7 @@ def check_prescribed(pair: Interface) -> None:
         ConflictError: naming the deepest or farthest node of the first rank with such a node.
         OverdeterminedError: likewise, if the node or its target can move and only other contacts contradict its equation.
     """
-    left_out = pair.trial.active & pair.redundant
+    left_out = pair.trial.active & pair.trial.redundant
     depth = -pair.projection.gap / pair.config.size
     inside = ~pair.off & ((~pair.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
     error = None

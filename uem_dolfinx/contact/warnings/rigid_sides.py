@@ -70,7 +70,7 @@ class RigidSides:
             return
         for contact in self._contacts:
             pair = contact.pair
-            if reduced(pair.config.comm, int((pair.trial.active & pair.redundant & self._rigid[pair.nodes]).sum())):
+            if reduced(pair.config.comm, int((pair.trial.active & pair.trial.redundant & self._rigid[pair.nodes]).sum())):
                 error.amend(
                     f"{contact.name}: equations of contactors on a rigid body depend on each other: make the rigid surface the target, "
                     "in general contact by order=[...] with the deformable body first",

@@ -25,7 +25,7 @@ def part_contacts(problem: Any) -> None:
         assert isinstance(whole, JoinedInterface)
         for k, pair in enumerate(pairs):
             known[id(pair)] = known[id(whole)]
-            kept[id(pair)] = whole.memory_of(k, kept[id(whole)][0]), None
+            kept[id(pair)] = whole.state_of(k, kept[id(whole)][0]), None
     after = problem.interfaces
     problem.motions = [known[id(pair)][0] for pair in after]
     remembered, motions = ([kept[id(pair)][i] for pair in after] for i in range(2))

@@ -135,7 +135,7 @@ class Exchanges:
         made = self._number >= (AS_LONG_IF_CHEAP if cheap else 0) and not (self.held or self._were_held or self.frozen)
         if self._on_arrays or not made or not self._pairs:
             return False
-        new = sum(int((w.enter & ~pair.reserved).sum()) for w, pair in zip(violated, self._pairs))
+        new = sum(int((w.enter & ~pair.trial.reserved).sum()) for w, pair in zip(violated, self._pairs))
         number, new = reduced(self._pairs[0].config.comm, np.array([sum(w.count for w in violated), new]))
         if not number or new:
             return False
@@ -232,7 +232,7 @@ class Exchanges:
         for pair, known in zip(self._pairs, self._known or ()):
             if pair.friction is not None and known is not None:
                 state, pair.friction.pivot = known
-                pair.trial = state
+                pair.trial = replace(state, reserved=pair.trial.reserved)
                 pair.friction.hold_limits(state.lam)
         self._pivoting, self.held, self._were_held, self.again = Pivoting(), True, True, True
         self._solve_again()
@@ -242,7 +242,7 @@ class Exchanges:
         self._known, each = self._here(violated), np.zeros(2)
         for pair, known in zip(self._pairs, self._known):
             if pair.friction is not None and known is not None:
-                pair.trial = known[0]
+                pair.trial = replace(known[0], reserved=pair.trial.reserved)
                 each = np.maximum(each, pair.friction.hold_limits(pair.trial.lam))
         self._pairs[0].config.comm.Allreduce(MPI.IN_PLACE, each, op=MPI.MAX)
         if each[0] <= LIMITS_NEAR * each[1]:
