@@ -54,7 +54,8 @@ class Interface(Readings):
         committed: state of the last step.
         kinematics: of the contactors, for the trial state; available after ``project``.
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
-        mutual: whether contactors and target follow each other (two-pass).
+        label: number of the contact of each contactor, among ``members`` ``(n,)``.
+        mutual: contacts whose contactors and target follow each other (two-pass) ``(n_contacts,)``.
         heats: heat flow, one object per conductance.
     """
 
@@ -79,7 +80,8 @@ class Interface(Readings):
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
         self.trial = self.committed = replace(state, friction=along, bond=bond)
         self.heats: list[Heat] = []
-        self.initial_overlap, self.mutual = 0.0, False
+        self.label: Ints = np.zeros(n, dtype=np.int64)
+        self.initial_overlap, self.mutual = 0.0, np.zeros(1, dtype=bool)
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
 
@@ -131,8 +133,14 @@ class Interface(Readings):
     def look(self) -> None:
         """Project contactors that were skipped because the surfaces are separated (collective)."""
         if self.far:
-            self.far = False
+            self._search()
             self.project()
+
+    def _search(self) -> None:
+        """Search for all contactors from the next placement on."""
+        far = self.discretisation.setting.far
+        if far.any():
+            self.discretisation.set(far=np.zeros_like(far))
 
     def return_vectors(self) -> Array:
         """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
@@ -142,7 +150,7 @@ class Interface(Readings):
         if self.friction is not None:
             correction = correction + self.friction.return_vectors(self.trial)
         # surfaces that follow each other would both close the same gap
-        correction[(np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size) | self.mutual] = 0.0
+        correction[(np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size) | self.mutual[self.label]] = 0.0
         return correction
 
     # -- activation and release ------------------------------------------------------------------------------------------
@@ -176,7 +184,7 @@ class Interface(Readings):
 
     def _at_end(self, state: PairState) -> Bools:
         """Contactors held by an end of the target in the next step ``(n,)``; none with two-pass contact, where the end itself touches."""
-        return self.kinematics.ends.held(state) & np.logical_not(self.mutual)
+        return self.kinematics.ends.held(state) & ~self.mutual[self.label]
 
     def follow(self) -> bool:
         """Release contactors past an end, follow the others from facet to facet (collective): whether an equation changes on this rank."""
@@ -398,6 +406,8 @@ class Interface(Readings):
         """Return to a committed state; call ``project`` afterwards, with bodies and target at their positions of that time."""
         # contactors that have been tied since then remain tied
         self.committed = state if self.tie is None else self.tie.untouched(state)
+        # an earlier state may bring the surfaces together
+        self._search()
         self.discretisation.commit()
         if self.friction is not None:
             self.friction.forget()

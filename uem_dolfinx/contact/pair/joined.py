@@ -8,19 +8,14 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
-
-from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.joined_nodes import JoinedNodes, JoinedSliding
 from uem_dolfinx.contact.pair.member import Member
 from uem_dolfinx.contact.pair.rows_of_states import joined, renumbered, rows, with_rows
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.parallel import reduced
 
 
 class JoinedInterface(Interface):
@@ -32,7 +27,6 @@ class JoinedInterface(Interface):
     Attributes:
         own: as above.
         members: access to each of the contacts.
-        label: number of the contact of each contactor ``(n,)``.
     """
 
     discretisation: JoinedNodes
@@ -47,8 +41,7 @@ class JoinedInterface(Interface):
             max_penetration=first.max_penetration, thickness=first.thickness,
         )  # fmt: skip
         self.own = list(own)
-        self.mutual: Any = np.zeros(len(self.nodes), dtype=bool)
-        self.mutual_of = np.zeros(len(own), dtype=bool)
+        self.label, self.mutual = nodal.label, np.zeros(len(own), dtype=bool)
         ends = np.cumsum([0, *(len(pair.nodes) for pair in own)])
         self.rows_of = [slice(a, b) for a, b in pairwise(ends.tolist())]
         self._members: list[weakref.ref[Member]] = []
@@ -67,22 +60,6 @@ class JoinedInterface(Interface):
         self._members = list(map(weakref.ref, members))
         return members
 
-    @property
-    def label(self) -> Ints:
-        """Number of the contact of each contactor ``(n,)``."""
-        return self.discretisation.label
-
-    def turns(self) -> Sequence[Any]:
-        """Groups of active contactors: first of the first contact of each node, then of the second (collective)."""
-        i = np.flatnonzero(self.trial.active)
-        i = i[np.argsort(self.nodes[i], kind="stable")]
-        turn = np.arange(len(i)) - np.searchsorted(self.nodes[i], self.nodes[i])
-        return [i[turn == k] for k in range(reduced(self.config.comm, int(turn.max(initial=-1)), op=MPI.MAX) + 1)]
-
-    def name_at(self, i: int) -> str:
-        """Name of the contact of a contactor."""
-        return self.own[self.label[i]].name
-
     def state_of(self, k: int, state: PairState) -> PairState:
         """A contact's part of a state, with its own numbers of facets."""
         facets, surface = self.discretisation.target.facets, self.discretisation.surface_of[k]
@@ -93,33 +70,19 @@ class JoinedInterface(Interface):
         facets, surface = self.discretisation.target.facets, self.discretisation.surface_of[k]
         return with_rows(state, self.rows_of[k], renumbered(part, lambda facet: facets.here(facet, surface)))
 
-    @property
-    def far_of(self) -> Bools:
-        """Contacts that are skipped ``(n_contacts,)``."""
-        return self.discretisation.far_of
-
-    @far_of.setter
-    def far_of(self, far: Bools) -> None:
-        self.discretisation.look_at(far)
-
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""
-        before, far = self.committed, self.discretisation.far_of[self.label]
+        before, far = self.committed, self.discretisation.setting.far[self.label]
         super().commit()
         if far.any():
             self.trial = self.committed = with_rows(self.committed, far, rows(before, far))
-
-    def remember(self, state: PairState) -> None:
-        """See ``Interface``; no contact is skipped."""
-        self.discretisation.far = False
-        super().remember(state)
 
     def part(self) -> list[Interface]:
         """The separate interfaces of the contacts, in their committed states; call ``project`` afterwards (collective)."""
         for k, (pair, member) in enumerate(zip(self.own, self.members)):
             if pair.friction is not None:
                 pair.friction.free = self.discretisation.free[self.rows_of[k]]
-            pair.initial_overlap, pair.mutual = member.initial_overlap, member.mutual
+            pair.initial_overlap = member.initial_overlap
             pair.remember(self.state_of(k, self.committed))
             pair.trial = self.state_of(k, self.trial)
         return self.own

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.friction.limits import Limits
 from uem_dolfinx.contact.friction.sliding import Sliding
 from uem_dolfinx.contact.laws.law import FrictionLaw, parameters
@@ -28,7 +28,6 @@ class JoinedNodes(NodeToSurface):
 
     Attributes:
         label: number of the contact of each contactor ``(n,)``.
-        far_of: contacts that are skipped ``(n_contacts,)``.
     """
 
     target: JoinedTarget
@@ -39,12 +38,12 @@ class JoinedNodes(NodeToSurface):
         number = {id(facets): k for k, facets in enumerate(surfaces)}
         self.label: Ints = np.repeat(np.arange(len(own)), [len(one.nodes) for one in own])
         self.surface_of = [number[id(facets)] for facets in targets]
-        self.far_of: Bools = np.zeros(len(own), dtype=bool)
         facets = JoinedFacets(first.config, surfaces)
         target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[self.label])
         how: dict[str, Any] = {"free": first.setting.free, "sliding": first.sliding, "thickness": first.thickness}
         super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
         self._own = own
+        self.set(far=np.zeros(len(own), dtype=bool))
         if any(one.offset is not None for one in own):
             self.set(offset=np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
 
@@ -53,36 +52,14 @@ class JoinedNodes(NodeToSurface):
         super().set(**changed)
         for one in getattr(self, "_own", ()) if "free" in changed else ():
             one.set(free=changed["free"])
-
-    @property
-    def far(self) -> bool:  # type: ignore[override]
-        """Whether all contacts are skipped."""
-        return bool(self.far_of.all())
-
-    @far.setter
-    def far(self, far: bool) -> None:
-        self.look_at(np.full(len(self.far_of), far))
-
-    def look_at(self, far: Bools) -> None:
-        """Set which contacts are skipped from now on ``(n_contacts,)``."""
-        self.far_of, self._projected = far, None
-        if hasattr(self, "target"):
-            self.target.asked = ~far[self.label]
+        if "far" in changed:
+            self.target.asked = ~changed["far"][self.label]
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
         """See ``OnTarget``; only for contacts with offsets."""
         i = np.flatnonzero(np.array([one.offset is not None for one in self._own])[self.label])
         assert self.offset is not None
         return found.with_those(i, found.take(i).across_edges(points[i], self.offset[i]))
-
-    def look_farther(self) -> bool:
-        """Include separated contacts from the next placement on; return whether there were any."""
-        was = bool(self.far_of.any())
-        self.far = False
-        return was
-
-    def commit(self) -> None:
-        """Accept a step; separated contacts remain skipped."""
 
 
 class JoinedLaw:

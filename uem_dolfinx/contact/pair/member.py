@@ -31,7 +31,7 @@ class Member(Interface):
         self.joined, self._k, self._rows = whole, k, whole.rows_of[k]
         self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
         self.name, self.sliding, self.max_penetration, self.thickness = own.name, own.sliding, own.max_penetration, own.thickness
-        self.tie, self.heats, self.initial_overlap = None, [], own.initial_overlap
+        self.tie, self.heats, self.initial_overlap, self.label = None, [], own.initial_overlap, own.label
         self._known: tuple[Kinematics, PairState, Kinematics] | None = None
 
     @property
@@ -60,16 +60,6 @@ class Member(Interface):
         self.joined.committed = self.joined.with_state_of(self._k, self.joined.committed, state)
 
     @property
-    def mutual(self) -> bool:  # type: ignore[override]
-        """Whether contactor and target of this contact follow each other."""
-        return bool(self.joined.mutual_of[self._k])
-
-    @mutual.setter
-    def mutual(self, value: bool) -> None:
-        self.joined.mutual_of[self._k] = value
-        self.joined.mutual = self.joined.mutual_of[self.joined.label]
-
-    @property
     def united(self) -> Bools:
         """Contactors that are active ``(n,)``."""
         return self.joined.trial.active[self._rows]
@@ -91,13 +81,13 @@ class Member(Interface):
     @property
     def far(self) -> bool:
         """Whether it is skipped, since the surfaces are separated."""
-        return bool(self.joined.discretisation.far_of[self._k])
+        return bool(self.joined.discretisation.setting.far[self._k])
 
-    @far.setter
-    def far(self, far: bool) -> None:
-        of = self.joined.discretisation.far_of.copy()
-        of[self._k] = far
-        self.joined.discretisation.look_at(of)
+    def _search(self) -> None:
+        if self.far:
+            far = self.joined.discretisation.setting.far.copy()
+            far[self._k] = False
+            self.joined.discretisation.set(far=far)
 
     @property
     def asked(self) -> bool:
@@ -137,11 +127,6 @@ class Member(Interface):
         return replace(corners, **parts)
 
     # -- changes between steps -------------------------------------------------------------------------------------------
-
-    def remember(self, state: PairState) -> None:
-        """See ``Interface``; the contact is not skipped."""
-        self.far = False
-        super().remember(state)
 
     def set_offset(self, offset: Array | None) -> None:
         """Set offsets ``(n,)``; contactors must be placed again (collective)."""

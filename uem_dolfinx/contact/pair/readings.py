@@ -31,6 +31,7 @@ class Readings:
     friction: Sliding | None
     tie: Tie | None
     committed: PairState
+    label: Ints
     kinematics: Kinematics
     discretisation: Discretisation
 
@@ -49,18 +50,9 @@ class Readings:
         """The joint interface that contains it: itself, unless several are treated together."""
         return self
 
-    @property
-    def label(self) -> Ints:
-        """Number of the contact of each contactor among ``members`` ``(n,)``."""
-        return np.zeros(len(self.nodes), np.int64)
-
-    def turns(self) -> Sequence[Any]:
-        """Groups of contactors that are returned to the target one after the other, each group with distinct nodes (collective)."""
-        return [slice(None)]
-
     def name_at(self, i: int) -> str:
         """Name of the contact of a contactor."""
-        return self.name
+        return str(self.members[self.label[i]].name)
 
     @property
     def asked(self) -> bool:
@@ -70,20 +62,7 @@ class Readings:
     @property
     def far(self) -> bool:
         """Whether it is skipped, since the surfaces are separated."""
-        return self.discretisation.far
-
-    @far.setter
-    def far(self, far: bool) -> None:
-        self.discretisation.far = far
-
-    @property
-    def far_of(self) -> Bools:
-        """Which of the ``members`` are skipped ``(n_members,)``."""
-        return np.array([self.far])
-
-    @far_of.setter
-    def far_of(self, far: Bools) -> None:
-        self.far = bool(far[0])
+        return bool(self.discretisation.setting.far.all())
 
     def set_offset(self, offset: Array | None) -> None:
         """Set offsets ``(n,)``; contactors must be placed again (collective)."""

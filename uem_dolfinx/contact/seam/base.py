@@ -35,9 +35,8 @@ class OnTarget:
 
     Attributes:
         free: components without Dirichlet condition of the contactors ``(n, gdim)``.
-        setting: conditions, offset and friction of the contactors.
+        setting: what is set for the contactors.
         anchor: projection whose closest points are kept, with small or fixed sliding.
-        far: whether the surfaces are separated, so that contactors are skipped, see ``solve.bodies.far_apart``.
         asked: whether any contactor on any rank was near the target in the last placement.
     """
 
@@ -49,21 +48,21 @@ class OnTarget:
     ):  # fmt: skip
         self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
         self.contactor = contactor
-        self.setting = Setting(free, False)
+        self.setting = Setting(free, False, far=np.zeros(1, dtype=bool))
         self.set(free=free)
         self.anchor: Projection | None = None
-        self.far, self.asked = False, True
+        self.asked = True
         #: Whether small sliding renews its closest points in the next step.
         self._renewing = False
         #: Last projection: positions of contactors and target, the anchor, and the result.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
 
     def set(self, **changed: Any) -> None:
-        """Set ``free``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
+        """Set ``free``, ``far``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
         if "free" in changed:
             self.free = changed["free"][self.nodes]
             changed["prescribed"] = bool(reduced(self.config.comm, int(not self.free.all())))
-        if "offset" in changed:
+        if changed.keys() & {"far", "offset"}:
             self._projected = None
         self.setting = self.setting._replace(**changed)
 
@@ -135,8 +134,10 @@ class OnTarget:
 
     def look_farther(self) -> bool:
         """Include separated surfaces from the next placement on; return whether they were separated."""
-        was, self.far = self.far, False
-        return was
+        far = self.setting.far
+        if far.any():
+            self.set(far=np.zeros_like(far))
+        return bool(far.any())
 
     def let_go(self) -> None:
         """Drop the kept closest points; the next placement finds new ones."""
@@ -144,8 +145,6 @@ class OnTarget:
 
     def commit(self) -> None:
         """Accept a step: small sliding renews its closest points in the next step, on rigid targets at the next placement."""
-        # a later return to an earlier state may bring the surfaces together
-        self.far = False
         if self.sliding == "small":
             self._renewing = True
             if not self.target.n_nodes:

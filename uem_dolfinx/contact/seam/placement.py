@@ -341,17 +341,19 @@ class Traits(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Conditions, offset and friction of the contactors of a discretisation, for all placements until a part is set anew.
+    """What is set for the contactors of a discretisation, for all placements until a part is set anew.
 
     Attributes:
         free: components of all owned nodes without Dirichlet condition ``(n_owned, gdim)``.
         prescribed: whether any contactor on any rank has a Dirichlet condition.
+        far: contacts whose surfaces are separated, so that their contactors are skipped, see ``solve.bodies.far_apart`` ``(n_contacts,)``.
         offset: heights minus gaps ``(n,)``; None without offset.
         cones: slopes of the contactors' cones of friction ``(n,)``; None without friction.
     """
 
     free: Bools
     prescribed: bool
+    far: Bools
     offset: Array | None = None
     cones: Array | None = None
 
@@ -361,7 +363,7 @@ class Discretisation(Protocol):
 
     @property
     def setting(self) -> Setting:
-        """Conditions, offset and friction of the contactors."""
+        """What is set for its contactors."""
 
     @property
     def target(self) -> Target:
@@ -375,13 +377,11 @@ class Discretisation(Protocol):
     def traits(self) -> Traits:
         """Properties that no placement changes."""
 
-    #: Whether the surfaces are separated, so that contactors are skipped.
-    far: bool
     #: Whether any contactor on any rank was near the target in the last placement; otherwise no other function is called.
     asked: bool
 
     def set(self, **changed: Any) -> None:
-        """Set ``free``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
+        """Set ``free``, ``far``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
 
     def spread(self, values: Array) -> Array:
         """Integrals with non-negative functions, from integrals with the shape functions ``(n,)`` (collective)."""

@@ -126,7 +126,7 @@ class TargetCorners:
             checked: contacts to be checked ``(n_pairs,)``.
         """
         whole, config, comm, n = self.whole, self._config, self._config.comm, len(self.pairs)
-        checked = checked & self.some & ~np.array([pair.mutual for pair in self.pairs])
+        checked = checked & self.some & ~whole.mutual
         if not checked.any():
             return {}
         near, label = self._near(checked)

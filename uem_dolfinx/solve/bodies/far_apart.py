@@ -166,14 +166,15 @@ class FarApart:
         """Mask of contacts that are not searched ``(n_pairs,)``."""
         far = np.zeros(len(self._pairs), dtype=bool)
         for place, pair in zip(self._places, self._wholes):
-            far[place] = pair.far_of
+            far[place] = pair.discretisation.setting.far
         return far
 
     def _set(self, far: Bools) -> list[Interface]:
         """Set the mask of contacts that are not searched ``(n_pairs,)``; returns the interfaces for which it has changed."""
-        found = [(place, p) for place, p in zip(self._places, self._wholes) if (far[place] != p.far_of).any()]
-        for place, pair in found:
-            pair.far_of = far[place]
+        changed = far != self._far
+        found = [(far[place], pair) for place, pair in zip(self._places, self._wholes) if changed[place].any()]
+        for some, pair in found:
+            pair.discretisation.set(far=some)
         return [pair for _, pair in found]
 
     def _look_at(self, near: Bools) -> list[Interface]:

@@ -72,8 +72,10 @@ class OverConstraints:
         # surfaces that are tied as a whole are never in contact; they share only edge nodes with other surfaces
         tied = np.array([pair.tie is not None and pair.tie.whole for pair in pairs], dtype=bool)
         refused = (both_ways & ~(tied[:, None] | tied)).any(axis=1)
-        for pair, mutual, wrong in zip(pairs, both_ways.any(axis=1), refused):
-            pair.mutual = bool(mutual)
+        ends = np.cumsum([len(pair.members) for pair in whole])
+        for pair, mutual in zip(whole, np.split(both_ways.any(axis=1), ends)):
+            pair.mutual = mutual
+        for pair, wrong in zip(pairs, refused):
             if wrong and not pair.discretisation.traits.two_pass:
                 raise ConflictError(
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
@@ -357,6 +359,14 @@ def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test
     rotated = independent.rotated(test)
     _refuse_wedged(pairs, test, rotated.undetermined)
     return rotated
+
+
+def in_turns(pair: Interface) -> list[Ints]:
+    """Groups of active contactors with distinct nodes: those of the first contact of each node, then of the second (collective)."""
+    i = np.flatnonzero(pair.trial.active)
+    i = i[np.argsort(pair.nodes[i], kind="stable")]
+    turn = np.arange(len(i)) - np.searchsorted(pair.nodes[i], pair.nodes[i])
+    return [i[turn == k] for k in range(reduced(pair.config.comm, int(turn.max(initial=-1)), op=MPI.MAX) + 1)]
 
 
 def _refuse_wedged(pairs: Sequence[Interface], test: UnitingEquations, wedged: Bools) -> None:

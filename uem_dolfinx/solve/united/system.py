@@ -134,7 +134,7 @@ class BodySystem:
             return False
         shared = self.over_constraints.shared
         for k, (pair, way) in enumerate(zip(self.near, ways)):
-            for j, rows in enumerate(pair.turns() if shared else [slice(None)]):
+            for j, rows in enumerate(united_rows.in_turns(pair) if shared else [np.arange(len(way))]):
                 if shared and j + k > 0:
                     # nodes may have been returned by another pair already
                     pair.project()
