@@ -23,6 +23,7 @@ from uem_dolfinx.contact import joining
 from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.pair.member import Member
 from uem_dolfinx.solve import problem as problems
+from uem_dolfinx.solve.steps.parted import part_contacts
 
 CALLS = ("Allreduce", "allreduce", "Allgather", "allgather", "Alltoall", "Alltoallv", "bcast")
 
@@ -297,3 +298,60 @@ def test_friction_that_follows_a_temperature_is_not_joined():
 
     assert joins(0.3) and joins(lambda x, t: t * x[0]) and joins(uem.Coulomb(0.2, limit=3.0))
     assert not joins(uem.OfTemperature(lambda x, t, T: 0.1 * T, field=1)) and not joins(uem.Tresca(1.0))
+
+
+def between_walls(mu):
+    """A block that is pressed into a corner of two rigid walls, which turn and move, and that a ball reaches in the second half."""
+    b = Bodies("quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [3, 3])])
+    walls = [uem.RigidPlane((0, 0), (0, 1)), uem.RigidPlane((0, 0), (1, 0)), uem.RigidSphere((1.6, 0.5), 0.55)]
+
+    def load(factor):
+        walls[0].move((0.0, 0.02 * factor), 0.02 * factor)
+        walls[1].move((0.01 * factor, -0.02 * factor))
+        walls[2].move((-0.1 * factor, 0.0))
+
+    every = surface_of(b.s, 0)
+    contacts = [uem.Contact(every, wall, friction=mu, name=f"wall {k}") for k, wall in enumerate(walls)]
+    bcs = clamp(b.V, b.side(0, 1, 1.0), 1, value=-0.03)
+    return contacts, b.problem(contacts, bcs, load=load)
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_rigid_surfaces_that_move(mu, folder, monkeypatch):
+    """A corner of two walls and a ball, each of which moves: steps, a run that goes on, and one in which they part."""
+    found = []
+    for together in (True, False):
+        if not together:
+            one_by_one(monkeypatch)
+        contacts, problem = between_walls(mu)
+        assert len(problem.interfaces) == (1 if together else 3)
+        steps = [s.newton_iterations for s in uem.load_steps(problem, 2)]
+        uem.write_checkpoint(folder / f"walls {together}", problem.state())
+        here = [told(contact) for contact in contacts]
+        assert all(contact.n_active > 0 for contact in contacts)
+        part_contacts(problem)
+        problem.solve()
+        assert len(problem.interfaces) == 3
+        found.append((problem.u, steps, here, [told(contact) for contact in contacts]))
+    (u, n, here, later), (v, m, there, then) = found
+    assert n == m
+    close(u, v)
+    for one, other in zip(here + later, there + then):
+        alike(one, other)
+    monkeypatch.undo()
+    contacts, problem = between_walls(mu)
+    uem.read_checkpoint(folder / "walls False", problem.state())
+    for contact, other in zip(contacts, there):
+        alike(told(contact), other)
+
+
+def test_no_passage_through_one_of_several_surfaces():
+    """A block that is led through a ball within a step is refused by the name of this contact among others."""
+    b = Bodies("quadrilateral", [box("quadrilateral", [-1.9, 0.1], [-1.8, 0.2], [1, 1])])
+    walls = [uem.RigidPlane((0, -9), (0, 1)), uem.RigidSphere((0, 0), 1.0), uem.RigidPlane((9, 0), (-1, 0))]
+    contacts = [uem.Contact(surface_of(b.s, 0), wall, name=f"wall {k}") for k, wall in enumerate(walls)]
+    bcs = clamp(b.V, b.s.tag("whole", 0, lambda x: np.full(len(x), True)), value=(3.8, 0.0))
+    problem = b.problem(contacts, bcs, line_search=False)
+    assert len(problem.interfaces) == 1
+    with pytest.raises(uem.TunnellingError, match="wall 1"):
+        problem.solve()

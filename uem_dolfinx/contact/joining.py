@@ -32,8 +32,8 @@ def attached(contacts: Sequence[Contact], config: Configuration, free: Bools, cl
 def join_alike(contacts: Sequence[Contact]) -> None:
     """Join similar contacts during the set-up of a problem (collective).
 
-    These are node-to-surface contacts of meshes with finite sliding, at degree 1, with the same normals and target thickness,
-    without friction or with Coulomb's law, without ties, wear and heat.
+    These are node-to-surface contacts of meshes, or with rigid surfaces, with finite sliding, at degree 1, with the same normals and
+    target thickness, without friction or with Coulomb's law, without ties, wear and heat.
     """
     groups: dict[Hashable, list[Contact]] = {}
     for contact in contacts:
@@ -70,16 +70,19 @@ def part(contacts: Sequence[Contact]) -> list[tuple[Interface, list[Interface]]]
 def _kind(contact: Contact) -> Hashable:
     """Common properties of contacts that can be joined; None for other contacts."""
     from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
+    from uem_dolfinx.geometry.rigid import RigidSurface
     from uem_dolfinx.geometry.search import MeshTarget
 
     pair = contact.pair
-    of = type(contact), type(pair), type(pair.discretisation), type(pair.target)
-    nodal = of == (Contact, Interface, NodeToSurface, MeshTarget)
+    rigid = isinstance(contact.target, RigidSurface)
+    if not rigid and not (type(contact) is Contact and type(pair.target) is MeshTarget):
+        return None
+    nodal = (type(pair), type(pair.discretisation)) == (Interface, NodeToSurface)
     if not nodal or contact.at_corners is not None or pair.sliding != "finite" or pair.tie is not None or pair.heats:
         return None
     if pair.friction is not None and not _joins(pair.friction):
         return None
-    return pair.frictional, pair.target.averaged, pair.thickness
+    return rigid, pair.frictional, pair.target.averaged, pair.thickness
 
 
 def _joins(friction: Sliding) -> bool:

@@ -25,6 +25,7 @@ from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.crossings import Crossings, cross_target, entries_and_exits
+from uem_dolfinx.geometry.joined_rigid import motions_of_each
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
@@ -75,7 +76,8 @@ def refuse_passages(
         if longest <= pair.target.stride:
             continue
         if len(pair.members) > 1:
-            refuse_passages(config, pair.members, start, [motion] * len(pair.members), moving)
+            each: Any = motions_of_each(motion, len(pair.members))  # type: ignore[arg-type]
+            refuse_passages(config, pair.members, start, each, moving)
             continue
         if isinstance(pair.target, MeshTarget):
             total = all_ways[:, k, 2:].sum(axis=0)

@@ -252,15 +252,10 @@ class Interface(Readings):
         self.trial = replace(self.trial, changes=np.where(some, MOST_CHANGES, changes))
         return bool(some.any())
 
-    def meet(self, others: Sequence[Interface]) -> None:
-        """Take the normals of other contacts with rigid surfaces at the same contactors (collective)."""
-        if self.friction is None:
-            return
-        normals = np.zeros((len(self.nodes), len(others), self.config.gdim))
-        for k, other in ((k, other) for k, other in enumerate(others) if other.trial.active.any()):
-            _, own, theirs = np.intersect1d(self.nodes, other.nodes, return_indices=True)
-            normals[own, k] = np.where(other.trial.active[theirs, None], other.projection.normal[theirs], 0.0)
-        self.friction.meet(self.kinematics, normals)
+    def meet(self, normals: Array) -> None:
+        """Take the normals of other contacts with rigid surfaces at the same contactors ``(n, k, gdim)`` (collective)."""
+        if self.friction is not None:
+            self.friction.meet(self.kinematics, normals)
 
     def place_again(self) -> None:
         """Place contactors again if their equations have changed (collective)."""

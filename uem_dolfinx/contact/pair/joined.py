@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
@@ -42,11 +41,10 @@ class JoinedInterface(Interface):
         )  # fmt: skip
         self.own = list(own)
         self.label, self.mutual = nodal.label, np.zeros(len(own), dtype=bool)
-        ends = np.cumsum([0, *(len(pair.nodes) for pair in own)])
-        self.rows_of = [slice(a, b) for a, b in pairwise(ends.tolist())]
+        self.rows_of = nodal.rows_of
         self._members: list[weakref.ref[Member]] = []
-        facets, surface = nodal.target.facets, nodal.surface_of
-        parts = [renumbered(p.committed, lambda f, s=s: facets.here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
+        here, surface = nodal.target.here, nodal.surface_of
+        parts = [renumbered(p.committed, lambda f, s=s: here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
         self.trial = self.committed = joined(parts)
 
     @property
@@ -62,13 +60,13 @@ class JoinedInterface(Interface):
 
     def state_of(self, k: int, state: PairState) -> PairState:
         """A contact's part of a state, with its own numbers of facets."""
-        facets, surface = self.discretisation.target.facets, self.discretisation.surface_of[k]
-        return renumbered(rows(state, self.rows_of[k]), lambda facet: facets.alone(facet, surface))
+        target, surface = self.discretisation.target, self.discretisation.surface_of[k]
+        return renumbered(rows(state, self.rows_of[k]), lambda facet: target.alone(facet, surface))
 
     def with_state_of(self, k: int, state: PairState, part: PairState) -> PairState:
         """The state with a contact's part."""
-        facets, surface = self.discretisation.target.facets, self.discretisation.surface_of[k]
-        return with_rows(state, self.rows_of[k], renumbered(part, lambda facet: facets.here(facet, surface)))
+        target, surface = self.discretisation.target, self.discretisation.surface_of[k]
+        return with_rows(state, self.rows_of[k], renumbered(part, lambda facet: target.here(facet, surface)))
 
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""

@@ -17,6 +17,7 @@ from uem_dolfinx.contact.friction.sliding import Sliding
 from uem_dolfinx.contact.laws.law import FrictionLaw, parameters
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
+from uem_dolfinx.geometry.joined_rigid import JoinedRigid
 from uem_dolfinx.geometry.projection import FacetProjection
 
 
@@ -30,16 +31,23 @@ class JoinedNodes(NodeToSurface):
         label: number of the contact of each contactor ``(n,)``.
     """
 
-    target: JoinedTarget
+    #: A ``JoinedTarget`` or ``JoinedRigid``.
+    target: Any
 
     def __init__(self, own: Sequence[NodeToSurface]):
-        first, targets = own[0], [one.target.facets for one in own]  # type: ignore[attr-defined]
-        surfaces = list({id(facets): facets for facets in targets}.values())
-        number = {id(facets): k for k, facets in enumerate(surfaces)}
+        first = own[0]
         self.label: Ints = np.repeat(np.arange(len(own)), [len(one.nodes) for one in own])
-        self.surface_of = [number[id(facets)] for facets in targets]
-        facets = JoinedFacets(first.config, surfaces)
-        target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[self.label])
+        ends = np.cumsum([0, *(len(one.nodes) for one in own)])
+        #: Contactors of each contact.
+        self.rows_of = [slice(a, b) for a, b in pairwise(ends.tolist())]
+        surfaces = [getattr(one.target, "facets", one.target) for one in own]
+        distinct: dict[int, Any] = {id(surface): surface for surface in surfaces}
+        #: Number of the surface of each contact.
+        self.surface_of = [list(distinct).index(id(surface)) for surface in surfaces]
+        target: Any = JoinedRigid([one.target for one in own], self.rows_of)
+        if first.target.n_nodes:
+            facets = JoinedFacets(first.config, list(distinct.values()))
+            target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[self.label])
         how: dict[str, Any] = {"free": first.setting.free, "sliding": first.sliding, "thickness": first.thickness}
         super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
         self._own = own
@@ -52,7 +60,7 @@ class JoinedNodes(NodeToSurface):
         super().set(**changed)
         for one in getattr(self, "_own", ()) if "free" in changed else ():
             one.set(free=changed["free"])
-        if "far" in changed:
+        if "far" in changed and self.target.n_nodes:
             self.target.asked = ~changed["far"][self.label]
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:

@@ -15,7 +15,7 @@ from uem_dolfinx.contact.pair.joined_nodes import JoinedLaw
 from uem_dolfinx.contact.seam.corners import Corners
 from uem_dolfinx.contact.seam.placement import Kinematics
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.rigid import RigidProjection
 
 
 class Member(Interface):
@@ -112,10 +112,12 @@ class Member(Interface):
         moves, left = (None if a is None else a[some] for a in (whole.target_moves, whole.left))
         return NodalKinematics(of, points, projection, nearest, whole.gap[some], self._corners_of(whole.corners), moves, left)
 
-    def _alone(self, p: FacetProjection) -> FacetProjection:
+    def _alone(self, p: Any) -> Any:
         nodal = self.joined.discretisation
-        parts = {f.name: v[self._rows] for f in fields(p) if (v := getattr(p, f.name)) is not None}
-        parts["facet"] = nodal.target.facets.alone(parts["facet"], nodal.surface_of[self._k])
+        parts = {f.name: v[self._rows] for f in fields(p) if isinstance(v := getattr(p, f.name), np.ndarray)}
+        parts["facet"] = nodal.target.alone(parts["facet"], nodal.surface_of[self._k])
+        if isinstance(p, RigidProjection):
+            parts["motion"] = self.target.motion
         return replace(p, **parts)
 
     def _corners_of(self, corners: Corners | None) -> Corners | None:

@@ -254,6 +254,10 @@ def check_moved(pair: Interface) -> None:
     """Raise InputError for a rigid target with different positions on different ranks (collective)."""
     if pair.target.n_nodes or pair.config.comm.size == 1:
         return
+    if len(pair.members) > 1:
+        for one in pair.members:
+            check_moved(one)
+        return
     m = pair.target.motion
     where = "not moved" if m is None else " ".join(f"{x:.9g}" for x in np.concatenate([m.translation, m.Q.ravel(), m.about]))
     given.alike(

@@ -7,6 +7,7 @@ from typing import Any
 
 from uem_dolfinx.contact.joining import part
 from uem_dolfinx.contact.pair.joined import JoinedInterface
+from uem_dolfinx.geometry.joined_rigid import motions_of_each
 from uem_dolfinx.solve.bodies.far_apart import FarApart
 from uem_dolfinx.solve.united.exchanges import Exchanges
 from uem_dolfinx.solve.united.rows import OverConstraints
@@ -24,8 +25,8 @@ def part_contacts(problem: Any) -> None:
     for whole, pairs in part(problem.contacts):
         assert isinstance(whole, JoinedInterface)
         for k, pair in enumerate(pairs):
-            known[id(pair)] = known[id(whole)]
-            kept[id(pair)] = whole.state_of(k, kept[id(whole)][0]), None
+            known[id(pair)] = motions_of_each(known[id(whole)][0], len(pairs))[k], known[id(whole)][1]
+            kept[id(pair)] = whole.state_of(k, kept[id(whole)][0]), motions_of_each(kept[id(whole)][1], len(pairs))[k]
     after = problem.interfaces
     problem.motions = [known[id(pair)][0] for pair in after]
     remembered, motions = ([kept[id(pair)][i] for pair in after] for i in range(2))

@@ -269,9 +269,8 @@ def make_rows(
     Raises:
         FrictionError: if contactors with several equations wedge.
     """
-    rigid = [pair for pair in pairs if not pair.target.n_nodes]
-    for pair in rigid if over_constraints.shared else ():
-        pair.meet([other for other in rigid if other is not pair])
+    if over_constraints.shared:
+        _meet([pair for pair in pairs if not pair.target.n_nodes])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
     fields = ((i, _united_fields(pair)) for i, pair in enumerate(pairs))
     heat = {i: [one.equations() for one in own] for i, own in fields if own}
@@ -293,6 +292,30 @@ def make_rows(
             _refuse_wedged(pairs, test, error.rows[: len(test)])
             raise
     return Rows(pairs, equations, whole, independent, rotated, Q, heat, None if linear is None else linear.rigid)
+
+
+def _meet(rigid: Sequence[Interface]) -> None:
+    """Let contacts with rigid surfaces know the normals of the others that hold the same contactors (collective)."""
+    if not rigid:
+        return
+    node, held = (np.concatenate(parts) for parts in zip(*((pair.nodes, pair.trial.active) for pair in rigid)))
+    normal = np.concatenate([pair.projection.normal for pair in rigid])
+    i = np.flatnonzero(held)
+    i = i[np.argsort(node[i], kind="stable")]
+    # contactors with several rows, each row among those of its node
+    there, group, counts = np.unique(node[i], return_inverse=True, return_counts=True)
+    place = np.arange(len(i)) - np.searchsorted(node[i], node[i])
+    k = int(counts.max(initial=1))
+    every = np.zeros((len(there) + 1, k if k > 1 else 0, normal.shape[1]))
+    if k > 1:
+        every[group, place] = normal[i]
+    at = np.searchsorted(there, node)
+    known = np.append(there, -1)[at] == node
+    others = every[np.where(known, at, len(there))]
+    if k > 1:
+        others[i, place] = 0.0
+    for pair, own in zip(rigid, np.split(others, np.cumsum([len(pair.nodes) for pair in rigid])[:-1])):
+        pair.meet(own)
 
 
 def _surfaces(pairs: Sequence[Interface]) -> tuple[list[Indices], Ints]:
