@@ -62,6 +62,25 @@ def test_vector_maps_are_those_of_the_matrix(name):
 
 
 @cases
+def test_other_gaps(name):
+    """With other gaps and prescribed increments P is kept, and c is that of a new restriction; other equations are not taken."""
+    r = CASES[name]().restriction()
+    if r.rings is not None:
+        return
+    rng = np.random.default_rng(COMM.rank)
+    prescribed = np.where(r.free, 0.0, rng.normal(size=r.free.shape))
+    equations = replace(r.equations, gap=rng.normal(size=len(r.equations)))
+    known, new = (
+        r.with_gaps(equations, r.free, prescribed, r.stacked),
+        Restriction(r.space, equations, r.free, prescribed, r.stacked),
+    )
+    assert (known.c - new.c).norm() <= 1e-15 * new.c.norm() and (known.P - new.P).norm() == 0.0
+    turned = replace(equations, direction=equations.direction * (1.0 + 1e-15))
+    assert (r.with_gaps(turned, r.free, prescribed, r.stacked) is None) == (COMM.allreduce(len(r.equations)) > 0)
+    assert r.with_gaps(equations, r.free, prescribed, not r.stacked) is None
+
+
+@cases
 def test_united_increment_solves_the_saddle_point_problem(name):
     case = CASES[name]()
     C, h = case.constraints()

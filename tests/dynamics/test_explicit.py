@@ -18,9 +18,10 @@ from helpers import at, box, clamp, scene
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
+from uem_dolfinx.dynamics.explicit.part_solver import PartSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
-from uem_dolfinx.dynamics.explicit.surface import SurfaceSolver
 from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.bodies.bodies import Bodies
 
 COMM = MPI.COMM_WORLD
 #: Without the checks of every state, which assemble residuals.
@@ -246,12 +247,36 @@ def test_a_step_assembles_nothing(monkeypatch):
         pass
     monkeypatch.setattr(uem.UnitedProblem, "attempt", ATTEMPT)
     monkeypatch.setattr(forms, "assemble_vector", lambda b, L: made.append("residual"))
-    for kind in (SurfaceSolver, UnitedSolver):
-        monkeypatch.setattr(kind, "_factorise" if kind is SurfaceSolver else "_set_up", lambda *a, **k: made.append("matrix"))
+    for kind, what in ((PartSolver, "_factorise"), (UnitedSolver, "_set_up")):
+        monkeypatch.setattr(kind, what, lambda *a, **k: made.append("matrix"))
     for _ in range(20):
         assert bar.contact.n_active == 2 or COMM.size > 1
         next(steps)
     assert not made
+
+
+@pytest.mark.parametrize("law", [uem.LinearElastic, uem.NeoHooke])
+def test_a_surface_that_comes_and_goes(monkeypatch, law):
+    """Where contact changes, the surface alone is factorised; its forces are those of the cells behind it, assembled without the others."""
+    bar, sizes = Flight(2, 12, law=law), []
+    monkeypatch.setattr(UnitedSolver, "_set_up", lambda *a, **k: pytest.fail("all unknowns are factorised"))
+    factorise = PartSolver._factorise
+    monkeypatch.setattr(PartSolver, "_factorise", lambda self, nodes, *a: sizes.append(len(nodes)) or factorise(self, nodes, *a))
+    write, bodies = [], bar.problem.bodies
+    assemble = Bodies.assemble
+    monkeypatch.setattr(Bodies, "assemble", lambda self, by=None: write.append(by) or assemble(self, by))
+    bar.run(0.8)
+    assert bar.contact.n_active == 0 and bar.rows[-1][3] > 0.0
+    assert sizes and reduced(COMM, max(sizes)) == 2
+    parts = [by for by in write if by is not None]
+    assert bool(parts) == (law is uem.NeoHooke)
+    if parts:
+        bodies.assemble()
+        every, some = bodies.residual_of_all, compat.create_vector(bar.u.function_space)
+        parts[-1](some)
+        light = ~bar.dynamics.massy.ravel()
+        assert np.abs((some.array_r - every)[light]).max(initial=0.0) <= 1e-12 * np.abs(every).max(initial=1.0)
+        assert reduced(COMM, float(np.abs(some.array_r - every).max(initial=0.0))) > 0.0
 
 
 def test_calls_of_a_step(monkeypatch):

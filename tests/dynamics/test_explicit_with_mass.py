@@ -14,6 +14,7 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.dynamics.explicit.mass_solver import MassSolver
+from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver
 from uem_dolfinx.parallel import reduced
 
 COMM = MPI.COMM_WORLD
@@ -128,6 +129,29 @@ def test_united_masses(how):
             solver.set_operator(P, M, G)
         one, other = (P.expand(solver.complete(solver.solve(rhs)[0])) for solver in (found, expected))
         assert (one - other).norm() <= 1e-10 * other.norm()
+
+
+@pytest.mark.parametrize("how", [{"dim": 2}, {"dim": 2, "coupling": "mortar"}, {"dim": 3, "cells": 10}], ids=str)
+def test_a_surface_alone(how):
+    """With only a few nodes free, the solution of P'KP is that of a factorisation of all unknowns, on any ranks; with G as well."""
+    problem, contact, _ = bars(lower=True, wide=2, gap=0.0, **how)
+    problem.contacts[0].pair.activate_touching()
+    bodies, space = problem.bodies, problem.config.unknowns
+    K, contactors = bodies.update_tangent(), problem.config.of(np.zeros(len(bodies.held), bool))
+    contactors[problem.contacts[0].pair.nodes] = contactors[problem.contacts[0].pair.discretisation.followed] = True
+    with bodies.holding(bodies.of_owners(~contactors.ravel())):
+        P = problem.system._rows().test
+        assert P.n_equations > 0
+        wave = space.vector(1.0 + np.random.default_rng(3 + COMM.rank).random(space.block * space.n_owned))
+        for G in (None, K):
+            found, expected = (
+                SurfaceSolver(space, "surface_"),
+                UnitedSolver(space, "all_", {"ksp_type": "preonly", "pc_type": "lu"}),
+            )
+            for solver in (found, expected):
+                solver.set_operator(P, K, G)
+            one, other = (P.expand(solver.complete(solver.solve(P.transpose(wave))[0])) for solver in (found, expected))
+            assert (one - other).norm() <= 1e-10 * other.norm()
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])

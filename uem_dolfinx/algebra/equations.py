@@ -14,7 +14,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
 from uem_dolfinx.parallel import Exchange
 
 #: An equation whose direction has less than this part left in the free components of its node cannot eliminate any.
@@ -50,6 +50,11 @@ class UnitingEquations:
 
     def __len__(self) -> int:
         return len(self.node)
+
+    @property
+    def but_gaps(self) -> tuple[AnyArray, ...]:
+        """All arrays but the gaps."""
+        return self.node, self.direction, self.active, self.row, self.followed, self.coefficients
 
     @staticmethod
     def along(node: Indices, direction: Array, targets: Ints, weights: Array, gap: Array, active: Bools) -> UnitingEquations:

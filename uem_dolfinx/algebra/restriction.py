@@ -17,8 +17,11 @@ coefficients, the powers decay and the series is cut at rounding; other rings ar
 from __future__ import annotations
 
 import zlib
+from copy import copy
 from functools import cached_property
 from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 import numpy.typing as npt
@@ -100,6 +103,17 @@ class Restriction:
         self._held = equations.select(equations.active)
         self._follows, self._term = np.unique(self._held.followed, return_inverse=True)
         self._halo = Halo(self.space, self._follows) if self._n_rows else None
+
+    def with_gaps(self, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool) -> Restriction | None:
+        """The same P with other increments c; None if more than gaps and prescribed increments differs on any rank (collective)."""
+        pairs = zip((self.free, *self.equations.but_gaps), (free, *equations.but_gaps))
+        alike = all(len(a) == len(b) and not (a != b).any() for a, b in pairs)
+        if self.rings is not None or self.stacked != stacked or not reduced(self.comm, alike, op=MPI.LAND):
+            return None
+        other = copy(self)
+        other.equations, other.d = equations, self._closing(prescribed, equations.gap)
+        other.__dict__.pop("c", None)
+        return other
 
     @property
     def alone(self) -> bool:

@@ -316,9 +316,10 @@ class Dynamics(given.Sealed):
 
     @timed("inertia forces")
     def load(self) -> PETSc.Vec:
-        """Inertia forces minus weight at the present displacement, to be added to the residual (collective)."""
-        load = self._inertia() if self.moving else self._like(self.forces.x.array[: self._n])
-        load.axpy(-1.0, self._weight)
+        """Inertia forces, which explicit steps find from the others, minus weight, to be added to the residual (collective)."""
+        load = -self._weight
+        if not (self.moving and isinstance(self.scheme, CentralDifferences)):
+            load.axpy(1.0, self._inertia() if self.moving else self._like(self.forces.x.array[: self._n]))
         if self.added:
             load.array[:] += self.added_forces()
         return load

@@ -315,12 +315,13 @@ class UnitedProblem(given.Sealed):
             return take_alone(self, start, fraction)
 
     def attempt(
-        self, *, start: np.ndarray | None = None, fraction: float = 1.0, along: ContactMethod | None = None
+        self, *, start: np.ndarray | None = None, fraction: float = 1.0, along: ContactMethod | None = None, system: Any = None
     ) -> list[Iteration]:
         """Bring the bodies into equilibrium, to be followed by ``commit`` or ``restore`` (collective).
 
         Args:
             start: displacement array at which the ramp of the Dirichlet values begins; None is the committed displacement.
+            system: in place of the problem's own.
             fraction: part of the ramp of the Dirichlet values, from ``start`` (0) to the values of ``bcs`` (1).
             along: method that controls the load in every iteration, without line search, such as arc length; or None.
 
@@ -345,7 +346,7 @@ class UnitedProblem(given.Sealed):
         self.bodies.wanted[:] = self.bodies.of_owners(ramped(self.load, self.bodies.bcs, start, wanted, fraction))
         try:
             self.bodies.begin_step()
-            history = converge_or_rest(self, start, fraction, along)
+            history = converge_or_rest(self, start, fraction, along, system or self.system)
         except UEMError as error:
             stiffness = self.bodies.stiffness
             self.restore()
@@ -431,13 +432,12 @@ class UnitedProblem(given.Sealed):
         """
         tdim = self.config.tdim
         nodes = surface_nodes(self.config, as_tag(tag, self.config.mesh, (tdim - 1, *range(tdim + 1)), "the support"))
-        force = self.config.of(reactions(self))[nodes]
-        sums = self.comm.allgather(np.where(self.bodies.free[nodes], 0.0, force).sum(axis=0))
+        sums = self.comm.allgather(np.where(self.bodies.free, 0.0, self.config.of(reactions(self)))[nodes].sum(axis=0))
         return self.config.of_circles(np.sum(sums, axis=0))
 
     @property
     def pairs(self) -> list[Interface]:
-        """The interface of every contact, with its contactors and target."""
+        """The interface of every contact."""
         return [contact.pair for contact in self.contacts]
 
     @property
@@ -446,5 +446,5 @@ class UnitedProblem(given.Sealed):
         return list({id(whole): whole for whole in [contact.pair.whole for contact in self.contacts]}.values())
 
     def rigid_motions(self) -> list[Motion | None]:
-        """Present motions of the rigid targets of all ``interfaces``; None for targets that have not moved, and for meshes."""
+        """Present motions of the rigid targets of all ``interfaces``; None for meshes, and targets that have not moved."""
         return [pair.target.motion for pair in self.interfaces]

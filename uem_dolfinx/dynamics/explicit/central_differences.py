@@ -22,10 +22,11 @@ class CentralDifferences:
         F_S(u_I(n+1), u_S(n+1)) = contact forces, gaps closed and cones of friction met, as in statics
         a(n+1) = -M^-1 F_I(u(n+1))             v(n+1) = v(n+1/2) + dt/2 a(n+1)
 
-    A step of bodies with linear elasticity multiplies by K instead of assembling the residual, unless their loads change, and no matrix
-    is factorised unless the contact changes. With ``Dynamics(..., contactors="massy")`` all nodes move by their masses, and contact
-    corrects them by the united system P'MP. Impacts of the surface's own mass are then plastic, and general contact and thin walls are
-    supported. Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011) 223-249, https://doi.org/10.1137/100791440.
+    A step of bodies with linear elasticity multiplies by K instead of assembling the residual, unless their loads change. Where contact
+    changes, and at first, the stiffness of the surface alone is factorised. With ``Dynamics(..., contactors="massy")`` all nodes move by
+    their masses, and contact corrects them by the united system P'MP. Impacts of the surface's own mass are then plastic, and general
+    contact and thin walls are supported. Source: Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33 (2011) 223-249,
+    https://doi.org/10.1137/100791440.
 
     Damping forms are those of the velocity in the middle of the step.
 

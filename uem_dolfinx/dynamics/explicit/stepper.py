@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 from mpi4py import MPI
@@ -17,7 +18,8 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.dynamics.explicit.critical import highest_eigenvalue
-from uem_dolfinx.dynamics.explicit.surface import SurfaceSolver
+from uem_dolfinx.dynamics.explicit.surface import Prediction
+from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver
 from uem_dolfinx.errors import InvertedElementError, MassError, StepAccuracyError
 from uem_dolfinx.parallel import gathered, reduced
 
@@ -65,7 +67,8 @@ class ExplicitStepper:
         if not problem.comm.allreduce(int(heavy.sum())):
             raise MassError("central differences need nodes with mass, and there are none: check the density")
         self._mass = m
-        self.surface = SurfaceSolver(problem)
+        #: United system that a step solves, and how its solution is predicted.
+        self.system, self.prediction = self._parts()
         #: Length that the last refused step might have had.
         self.limit = np.inf
         #: Part of the critical step that resolves closed contacts.
@@ -86,13 +89,24 @@ class ExplicitStepper:
         self._moved, self.sudden = np.inf, False
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
 
+    def _parts(self) -> tuple[Any, Any]:
+        """Make ``system`` and ``prediction`` (collective)."""
+        # of the same bodies and contacts, with a solver of its own
+        system = copy(self.problem.system)
+        system.solver = SurfaceSolver(self.problem.config.unknowns, "uem_surface_")
+        return system, Prediction(self.problem, system, self.interior)
+
+    def forget(self) -> None:
+        """Begin the next step as after a restart."""
+        self.prediction.kept = False
+
     def begin(self) -> None:
         """Bring the surface into equilibrium at the start, and find the first accelerations (collective)."""
         problem, dynamics = self.problem, self.dynamics
         # no time passes, so that any length serves
         dynamics.begin(1.0)
         with problem.bodies.holding(self.interior):
-            problem.attempt(start=problem.committed)
+            problem.attempt(start=problem.committed, system=self.system)
             a = self._accelerations()
         dynamics.restore()
         problem.keep()
@@ -108,19 +122,19 @@ class ExplicitStepper:
         start[:n] += dt * half
         dynamics.begin(dt)
         with problem.bodies.holding(self.interior):
-            self.surface.predict(start)
-            history = problem.attempt(start=start)
+            self.prediction.predict(start)
+            history = problem.attempt(start=start, system=self.system)
             a = self._accelerations()
         self._refuse_cells(dt, a, before)
         self._refuse_given_energy(dt)
-        self.surface.learn(history)
+        self.prediction.learn(history)
         dynamics.end_with(half + 0.5 * dt * a, a)
         problem.commit()
         return history
 
     def _accelerations(self) -> Array:
         """Accelerations of the moving components under the forces of bodies and contacts, zero elsewhere ``(n,)`` (collective)."""
-        system = self.problem.system
+        system = self.system
         return -self._inverse * system.rows.test.pass_on(system.residual()).array_r
 
     def pattern(self) -> tuple[int, ...]:
@@ -212,8 +226,8 @@ class ExplicitStepper:
         fixed = self._highest(self._stiffness_if_fixed)
         with problem.bodies.holding(self.interior):
             # inertia holds the bodies, not supports
-            problem.system.floating.begin_motion()
-            system, self._P = problem.system, problem.system.restriction()
+            self.system.floating.begin_motion()
+            system, self._P = self.system, self.system.restriction()
             system.solver.set_operator(self._P, problem.bodies.tangent.K, None, self._P)
             condensed = self._highest(self._stiffness)
         stiff = fixed > STIFF_SURFACE * condensed
@@ -273,7 +287,7 @@ class ExplicitStepper:
 
     def _stiffness(self, field: Array) -> Array:
         """``K_II - K_IS K_SS^-1 K_SI`` times a field, with the constraints of contact on the surface ``(n,)`` (collective)."""
-        P, solver = self._P, self.problem.system.solver
+        P, solver = self._P, self.system.solver
         du = P.carried(field.reshape(-1, self.problem.config.gdim))
         dq, _ = solver.solve(-P.transpose(self._times_K(du)), 0.0)
         du.axpy(1.0, P.expand(solver.complete(dq)))

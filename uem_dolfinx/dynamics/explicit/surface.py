@@ -5,15 +5,19 @@ The Newton loop of the united system then has nothing left to do but to check fo
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import ufl
 from petsc4py import PETSc
 
-from uem_dolfinx import compat
-from uem_dolfinx.algebra.products import UnitedMatrix
-from uem_dolfinx.arrays import Ints
-from uem_dolfinx.log import timed
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Bools
+from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver, numbers
+from uem_dolfinx.log import compiling
 
 #: Solves with the kept matrix in one step, before Newton's method goes on with its own.
 #: [bound; solves; -]
@@ -23,19 +27,25 @@ MOST_SURFACE_SOLVES = 4
 ITERATIONS_OF_KEPT = 1
 
 
-class SurfaceSolver:
-    """Solves for the surface of a problem with the equations of its last state (collective).
+class Prediction:
+    """Moves the surface of a problem with the equations of its last state (collective).
 
     Args:
         problem: a ``UnitedProblem``, whose nodes with mass are held while it is used.
+        system: its united system, of which the surface is solved.
+        massive: mask of the unknowns that are held, ghosts included ``(n,)``.
 
     Attributes:
         kept: whether the factorisation is of the present contact, and good enough.
     """
 
-    def __init__(self, problem: Any):
-        self.problem, self.kept = problem, False
-        self._pc: Any = None
+    def __init__(self, problem: Any, system: Any, massive: Bools):
+        self.problem, self.system, self.kept = problem, system, False
+        self._massive, self._solver = massive, SurfaceSolver(problem.bodies.unknowns, "uem_prediction_")
+        #: State of the values of K whose columns at the surface are known.
+        self._state = -1
+        #: Writes the residual of the cells behind the surface; None if it is as well to write that of all.
+        self._write: Callable[[PETSc.Vec], None] | None = None
 
     def learn(self, history: Any) -> None:
         """Take note of how much the Newton loop has had to do in a step."""
@@ -43,52 +53,70 @@ class SurfaceSolver:
 
     def predict(self, start: Any) -> None:
         """Move nodes with mass to ``start (n,)``, ghosts included, and the surface from there into equilibrium with the last contact."""
-        problem, bodies, system = self.problem, self.problem.bodies, self.problem.system
+        problem, bodies, system = self.problem, self.problem.bodies, self.system
         if system.rows is None:
             return
         if not self.kept:
-            self._factorise()
+            self._prepare()
         u = np.array(start)
         compat.set_bc_values(u, bodies.bcs)
         bodies.u.x.array[:] = u
         bodies.u.x.scatter_forward()
-        fine, before = bodies.assemble_once(), np.inf
+        fine, before = self._assemble(), np.inf
         for _ in range(MOST_SURFACE_SOLVES):
             F = self._Q.transpose(system.residual())
             norm = F.norm()
             if not fine or norm >= before or norm <= problem.rtol * bodies.residual.norm():
                 break
-            with timed("linear solve"):
-                self._rhs.array[:] = F.array_r[self._at]
-                self._pc.apply(self._rhs, self._dq)
-            F.array[:] = 0.0
-            F.array[self._at] = -self._dq.array_r
-            fine, before = bodies.move(self._P.expand(F)), norm
+            dq, _ = self._solver.solve(-F)
+            du, before = self._P.expand(dq), norm
+            if bodies.linear:
+                self._du.array[:] = du.array_r[self._light]
+                change = du.duplicate()
+                self._K.mult(self._du, change)
+                bodies.move(du, change)
+            else:
+                bodies.move(du)
+                fine = self._assemble()
         if not fine:
             # Newton's method has a line search
             bodies.u.x.array[:] = problem.committed
 
-    def _factorise(self) -> None:
-        """Factorise ``Q'KP`` of the surface's unknowns."""
-        system, bodies = self.problem.system, self.problem.bodies
+    def _assemble(self) -> bool:
+        """Assemble the forces at the surface at least; whether they are finite on all ranks (collective)."""
+        bodies = self.problem.bodies
+        return bool(bodies.assemble_once() if self._write is None else bodies.assemble(self._write))
+
+    def _prepare(self) -> None:
+        """Factorise ``Q'KP`` of the surface's unknowns, and find what their motion changes (collective)."""
+        system, bodies = self.system, self.problem.bodies
         self._P, self._Q = system.rows.frictionless, system.rows.test
-        space, P = bodies.unknowns, self._P
-        A = UnitedMatrix(space, False).update(P, self._Q, bodies.update_tangent(), None)
-        self._at: Ints = np.flatnonzero(P.used)
-        own = PETSc.IS().createGeneral((self._at + space.block * space.first).astype(PETSc.IntType), comm=space.comm)
-        self._A = A.createSubMatrix(own, own)
-        self._rhs, self._dq = self._A.createVecs()
-        self._pc, self.kept = factorised(self._A, P is self._Q), True
+        self._solver.set_operator(self._P, K := bodies.update_tangent(), None, self._Q)
+        space, self.kept = bodies.unknowns, True
+        if bodies.linear and self._state != K.stateGet():
+            self._state, self._light = K.stateGet(), np.flatnonzero(bodies.free_rows)
+            self._K = K.createSubMatrix(numbers(space, np.arange(bodies.free_rows.size)), numbers(space, self._light))
+            self._du = self._K.createVecRight()
+        elif not bodies.linear and self._write is None and not bodies.materials:
+            config = bodies.config
+            cells = np.flatnonzero(~config.of(self._massive).all(axis=1)[compat.cell_dofs(config.V)].all(axis=1))
+            if (F := _in_cells(bodies.F, cells)) is not None:
+                with compiling("the residual behind the surface"):
+                    self._write = partial(forms.assemble_vector, L=forms.form(F))
 
 
-def factorised(A: PETSc.Mat, symmetric: bool) -> PETSc.PC:
-    """A matrix, factorised (collective)."""
-    A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-    pc = PETSc.PC().create(A.comm)
-    pc.setType("cholesky" if symmetric else "lu")
-    if A.comm.size > 1:
-        pc.setFactorSolverType("mumps")
-    pc.setOperators(A)
-    with timed("factorisation or preconditioner set-up"):
-        pc.setUp()
-    return pc
+def _in_cells(F: ufl.Form, cells: npt.ArrayLike) -> ufl.Form | None:
+    """A form whose integrals over cells are restricted to some cells ``(n,)``; None if they have other marks than MeshTags."""
+    integrals = []
+    for integral in F.integrals():
+        of = integral.subdomain_data()
+        if integral.integral_type() == "cell":
+            own, ids = cells, np.ravel(integral.subdomain_id())
+            if "everywhere" not in ids:
+                if not hasattr(of, "indices"):
+                    return None
+                own = np.intersect1d(cells, of.indices[np.isin(of.values, ids.astype(np.int32))])
+            tags = forms.mesh_tags(F.arguments()[0].ufl_function_space().mesh, F.ufl_domain().topological_dimension(), own, 1)
+            integral = integral.reconstruct(subdomain_data=tags, subdomain_id=1)
+        integrals.append(integral)
+    return ufl.Form(integrals)

@@ -128,8 +128,8 @@ class Bodies:
 
     # -- forces --------------------------------------------------------------------------------------------------------
 
-    def assemble(self) -> bool:
-        """Assemble the residual ``F(u)`` at the present displacement; whether it is finite on all ranks (collective)."""
+    def assemble(self, write: Callable[[PETSc.Vec], None] | None = None) -> bool:
+        """Assemble ``F(u)`` at the present displacement, or a part by ``write``; whether it is finite on all ranks (collective)."""
         if self._assembled_at is not None:
             same = reduced(self.comm, bool(np.array_equal(self._assembled_at, self.u.x.array)), op=MPI.LAND)
             self._assembled_at = None
@@ -143,7 +143,7 @@ class Bodies:
         if self.dynamics is not None:
             self.dynamics.update_rates()
         with timed("assemble residual"):
-            self._assemble(self._b)
+            (write or self._assemble)(self._b)
             if self.points is not None:
                 self.points.add_forces(self._b.array)
             if self.dead is not None:
@@ -379,16 +379,14 @@ class Bodies:
         self._assembled_at = np.array(self.u.x.array)
         return finite
 
-    def move(self, du: PETSc.Vec) -> bool:
-        """Add an increment to the displacement, as ``assemble_once``; the residual of linear bodies changes by ``K du`` (collective)."""
+    def move(self, du: PETSc.Vec, change: PETSc.Vec | None = None) -> None:
+        """Add an increment to the displacement, and what it changes to the residual, if known, see ``assemble_once`` (collective)."""
         self._assembled_at = None
         self._u.array[:] += self.config.from_rows(du.array_r)
         self.u.x.scatter_forward()
-        if self.linear:
-            self.tangent.update()
-            self._b.array[:] += self.config.from_rows(forms.product(self.tangent.K, du).array_r)
+        if change is not None:
+            self._b.array[:] += self.config.from_rows(change.array_r)
             self._assembled_at = np.array(self.u.x.array)
-        return self.linear or self.assemble_once()
 
     def inverted(self) -> str | None:
         """Position of an inverted cell, or None (collective)."""

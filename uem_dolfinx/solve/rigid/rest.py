@@ -76,7 +76,7 @@ class _Drag:
         K.assemble()
 
 
-def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any) -> list[Any]:
+def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any, system: Any) -> list[Any]:
     """Converge; if bodies without friction that only contact holds do not come to rest, once more by a decaying drag (collective).
 
     Args:
@@ -84,11 +84,12 @@ def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any) ->
         start: see ``UnitedProblem.attempt``.
         fraction: likewise.
         along: likewise.
+        system: likewise.
 
     Raises:
         UEMError: of the first attempt, if the drag does not bring them to rest, either.
     """
-    converge = partial(problem.converge, problem.bodies, problem.system, start, fraction, along)
+    converge = partial(problem.converge, problem.bodies, system, start, fraction, along)
     try:
         return converge()
     except (ConvergenceError, FloatingBodyError) as error:

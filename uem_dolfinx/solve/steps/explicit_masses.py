@@ -65,7 +65,7 @@ class InertBodies(Bodies):
         self.tangent.K.assemble()
         self.stiffness = self.stiffness_at_start = factor.reshape(-1, self.config.gdim)
 
-    def assemble(self) -> bool:
+    def assemble(self, write: Any = None) -> bool:
         """Inertia forces on the way from the freely moved state; whether they are finite on all ranks (collective)."""
         self._b.array[:] = self._factor * (self._u.array_r - self.free_to)
         return bool(np.isfinite(self._b.norm()))
@@ -90,9 +90,16 @@ class StepperWithMass(ExplicitStepper):
                 f"{bare} free components have no mass, which CentralDifferences with contactors='massy' cannot move: give all bodies "
                 "a density, or take contactors='massless'"
             )
+
+    def _parts(self) -> tuple[Any, Any]:
+        """Make ``system``, whose solution is not predicted (collective)."""
+        problem = self.problem
         self.bodies = InertBodies(problem.bodies, self._mass)
         solver = MassSolver(problem.config.unknowns, "uem_masses_")
-        self.system = BodySystem(self.bodies, problem.interfaces, solver, consistent_tangent=False, linear=problem.linear)
+        return BodySystem(self.bodies, problem.interfaces, solver, consistent_tangent=False, linear=problem.linear), None
+
+    def forget(self) -> None:
+        """A step depends on its beginning alone."""
 
     def begin(self) -> None:
         """Find the first accelerations (collective)."""

@@ -54,7 +54,7 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
             dynamics.restore()
             problem.set_load(dynamics.time)
             problem.restore()
-            stepper.surface.kept = False
+            stepper.forget()
             if isinstance(error, StepAccuracyError):
                 # until the critical step is found anew
                 length = min(length, dynamics.scheme.safety * stepper.limit)

@@ -49,6 +49,8 @@ class OverConstraints:
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None):
         self._unknowns = config.unknowns
+        #: The restriction made last.
+        self._last: Restriction | None = None
         # joined contacts are compared one by one
         surfaces, which = _surfaces([one for pair in pairs for one in pair.members])
         follows = [followed_nodes(config, dofs) for dofs in surfaces]
@@ -126,8 +128,12 @@ class OverConstraints:
         independent = self._independent(given, left, None, firm) if self.contestable else None
         own = given if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
+        every = joined(own, rigid, g)
+        if self._last is not None and (known := self._last.with_gaps(every, free, prescribed, stacked)) is not None:
+            return known, independent
         try:
-            return Restriction(self._unknowns, joined(own, rigid, g), free, prescribed, stacked), independent
+            self._last = Restriction(self._unknowns, every, free, prescribed, stacked)
+            return self._last, independent
         except DependentRingError as error:
             ring = error.rows[: len(own)] if independent is None else independent.of_given(error.rows[: len(own)])
         independent = self._independent(given, left, ring, firm)
