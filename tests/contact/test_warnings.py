@@ -122,7 +122,7 @@ def test_contactors_that_are_left_inside(depth, free, left_out, refused, size):
     n = len(pair.nodes)
     seen = SimpleNamespace(
         name_at=lambda i: pair.name, config=pair.config, nodes=pair.nodes, off=np.zeros(n, bool), movable=np.full(n, free),
-        redundant=np.full(n, left_out), trial=SimpleNamespace(active=np.ones(n, bool)),
+        trial=SimpleNamespace(active=np.ones(n, bool), redundant=np.full(n, left_out)),
         projection=SimpleNamespace(gap=np.full(n, -depth * pair.config.size)), tie=None, kinematics=pair.kinematics,
     )  # fmt: skip
     if refused:

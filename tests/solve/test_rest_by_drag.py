@@ -81,4 +81,4 @@ def test_nothing_rests_on_a_slope():
     problem = uem.UnitedProblem(F, b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
     with pytest.raises(FloatingBodyError, match="no contact stops it"):
         list(uem.load_steps(problem, 1))
-    assert not problem.u.x.array.any() and problem.bodies.points is None and problem.system.floating.motions is not None
+    assert not problem.u.x.array.any() and problem.bodies.tangent.points is None and problem.system.floating.motions is not None

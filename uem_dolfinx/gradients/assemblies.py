@@ -60,8 +60,8 @@ class Users:
             InputError: for a value that is ramped from a displacement that depends on earlier steps.
         """
         problem, pushed = self._problem, np.zeros((self._problem.config.n_owned, self._problem.config.gdim))
-        if problem.bodies.points is not None:
-            pushed = -_difference(m, change, problem.bodies.points.loads)
+        if problem.bodies.tangent.points is not None:
+            pushed = -_difference(m, change, problem.bodies.tangent.points.loads)
         for contact in problem.contacts:
             if any(m is one for one in constants_of_law(contact)):
                 pushed = pushed + float(change) * contact.pair.pushed_by(m)  # type: ignore[attr-defined]

@@ -143,7 +143,7 @@ class History(given.Sealed):
             shares=shares,
             held=held,
             dt=0.0 if dynamics is None else dynamics.dt,
-            told=Prescribed.of(problem),
+            prescribed=Prescribed.of(problem),
         )
 
     def gradient(
@@ -237,12 +237,12 @@ class History(given.Sealed):
         problem = self.problem
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
         values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
-        offsets, told = [pair.discretisation.setting.offset for pair in problem.pairs], Prescribed.of(problem)
+        offsets, prescribed = [pair.discretisation.setting.offset for pair in problem.pairs], Prescribed.of(problem)
         try:
             yield
         finally:
             self._put(values, friction, offsets)
-            told.put_back(problem)
+            prescribed.put_back(problem)
             now.put_back(problem)
             problem.u.x.array[:] = displacement
 
@@ -357,7 +357,7 @@ class History(given.Sealed):
         """Set the problem to the end of a recorded step, before its commit (collective)."""
         problem = self.problem
         self._put(record.values, record.friction, record.offsets)
-        record.told.put_back(problem)
+        record.prescribed.put_back(problem)
         record.before.put_back(problem)
         problem.u.x.array[:] = record.displacement
         move_targets(problem, record.motions)

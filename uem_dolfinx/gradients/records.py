@@ -32,7 +32,7 @@ class Record:
         shares: of Constants and offsets, see ``solve.taken``, by their ids.
         held: shares of Dirichlet values, ghosts included ``(n,)``, or one share of all.
         dt: length of a time step; 0 in statics.
-        told: what equations, couplings and preloads prescribe.
+        prescribed: what equations, couplings and preloads prescribe.
     """
 
     before: Memory
@@ -45,7 +45,7 @@ class Record:
     shares: dict[int, float]
     held: Array | float
     dt: float
-    told: Prescribed
+    prescribed: Prescribed
 
 
 class Records:

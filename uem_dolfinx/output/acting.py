@@ -114,7 +114,7 @@ class Actions:
 
     def points(self) -> None:
         """Collect forces and springs at points (collective)."""
-        points = self.problem.bodies.points
+        points = self.problem.bodies.tangent.points
         for one, nodes in points.parts if points is not None else ():
             (force, k), at = one.force_and_stiffness(self.gdim), self.config.X[nodes]
             kind, name, vector = ("load", "point load", force) if k is None else ("spring", "spring", np.diag(k))

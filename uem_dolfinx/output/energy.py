@@ -138,8 +138,8 @@ class EnergyBook(Closing, given.Sealed):
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
         reaction = (driving - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external) + linear
-        if problem.bodies.points is not None:
-            outer += problem.bodies.points.loads().ravel()
+        if problem.bodies.tangent.points is not None:
+            outer += problem.bodies.tangent.points.loads().ravel()
         if added := self.dynamics.added:
             # forces of masses at points on their couplings, with the opposite sign
             outer -= self.dynamics.added_forces(carried=True)
@@ -161,7 +161,7 @@ class EnergyBook(Closing, given.Sealed):
         """Energies kinetic, stored and dissipated (collective)."""
         stored = forms.assemble_scalar(self._stored, self.problem.comm) if self._stored is not None else 0.0
         stored += sum(material.energy() for material in self.problem.materials)
-        stored += 0.0 if (points := self.problem.bodies.points) is None else points.energy()
+        stored += 0.0 if (points := self.problem.bodies.tangent.points) is None else points.energy()
         dissipated = float(sum(material.dissipation() for material in self.problem.materials))
         return self.dynamics.kinetic_energy(), stored, dissipated
 

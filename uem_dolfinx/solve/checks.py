@@ -215,7 +215,7 @@ def check_values(problem: Any, wanted: Array) -> None:
         _warn_of_two_values(problem.config, problem.bodies.bcs, wanted)
     if problem.comm.size == 1:
         return
-    points = [] if problem.bodies.points is None else [one for one, _ in problem.bodies.points.parts]
+    points = [] if problem.bodies.tangent.points is None else [one for one, _ in problem.bodies.tangent.points.parts]
     forms = {name: form for name, form in problem.settings.forms.items() if isinstance(form, ufl.Form)}
     values = {f"Constant {i} of {name}": c.value for name, form in forms.items() for i, c in enumerate(form.constants(), 1)}
     values |= {

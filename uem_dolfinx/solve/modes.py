@@ -118,10 +118,9 @@ def modes(problem: UnitedProblem, n: int = 6, *, mass: Mass | None = None, diame
             else:
                 A, B = _united(P, stiffness), _united(P, together(M, added))
                 block, used, expand = A, P.used.ravel(), lambda q: P.expand(P.space.vector(q))
-    diagonal = block.getDiagonal()
-    # idle components
-    diagonal.array[~P.used.ravel()] = diagonal.max()[1]
-    block.setDiagonal(diagonal)
+    _move_idle(A, used)
+    if block is not A:
+        _move_idle(block, P.used.ravel())
     if not is_symmetric(block, config.unknowns):
         raise InputError(
             "modes need a symmetric tangent, and that of this problem is not, as with a temperature that strains bodies: leave such fields "
@@ -181,6 +180,13 @@ def _united(P: Restriction, A: PETSc.Mat) -> PETSc.Mat:
     return A
 
 
+def _move_idle(A: PETSc.Mat, used: Bools) -> None:
+    """Give components that are not ``used`` a stiffness, for infinite frequencies (collective)."""
+    diagonal = A.getDiagonal()
+    diagonal.array[~used] = diagonal.max()[1]
+    A.setDiagonal(diagonal)
+
+
 def _solve(
     slepc: Any, problem: UnitedProblem, used: Bools, expand: Callable[[Array], PETSc.Vec], A: PETSc.Mat, B: PETSc.Mat, n: int
 ) -> Vibrations:
@@ -202,9 +208,6 @@ def _solve(
         raise InputError(f"n = {n}: expected no more than {moving} modes, the number of free components with mass")
     # in the displacement's rows, which come first
     largest = problem.config.vector(stiffness.array_r[: problem.config.n_owned * problem.config.gdim]).norm() / inertia.norm()
-    # idle components get infinite frequencies
-    stiffness.array[~used] = stiffness.max()[1]
-    A.setDiagonal(stiffness)
     eps = slepc.EPS().create(comm)
     eps.setOperators(A, B)
     eps.setProblemType(slepc.EPS.ProblemType.GHEP)

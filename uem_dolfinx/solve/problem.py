@@ -14,7 +14,7 @@ from uem_dolfinx.compiled import with_options
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact, parts_of
 from uem_dolfinx.contact.joining import attached, join_alike
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, motions_of
 from uem_dolfinx.contact.warnings.checks import check_moved, check_new
 from uem_dolfinx.contact.warnings.watch import Watch
 from uem_dolfinx.errors import InputError, UEMError
@@ -395,11 +395,11 @@ class UnitedProblem(given.Sealed):
             self.dynamics.commit()
             if self.linear is not None:
                 self.linear.settle(self.dynamics)
-        before = {id(pair): pair.committed for pair in pairs}
+        before = dict(zip(map(id, pairs), self._before.pairs))
         for pair in pairs:
             pair.commit()
             pair.project()
-        self.motions = [pair.target.motion for pair in pairs]
+        self.motions = motions_of(pairs)
         self.watch.look(before, self.bodies.stiffness)
 
     def restore(self) -> None:
@@ -446,5 +446,5 @@ class UnitedProblem(given.Sealed):
         return list({id(whole): whole for whole in [contact.pair.whole for contact in self.contacts]}.values())
 
     def rigid_motions(self) -> list[Motion | None]:
-        """Present motions of the rigid targets of all ``interfaces``; None for meshes, and targets that have not moved."""
-        return [pair.target.motion for pair in self.interfaces]
+        """Present motions of the rigid targets of all ``interfaces``; None for targets that have not moved, and for meshes."""
+        return motions_of(self.interfaces)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
     from uem_dolfinx.contact.thermal.heat import Heat
     from uem_dolfinx.contact.ties.tie import Tie
+    from uem_dolfinx.geometry.rigid import Motion
 
 #: Contactors this part of the model's size from where they belong are there.
 #: [derived; the model's size; test_system.py::test_the_normal_return]
@@ -419,3 +420,8 @@ class Interface(Readings):
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:
     """Pairs with a contactor near the target on any rank; in an iteration, the other pairs are only placed."""
     return [pair for pair in pairs if pair.asked]
+
+
+def motions_of(pairs: Sequence[Interface]) -> list[Motion | None]:
+    """Present motions of the pairs' rigid targets; None for targets that have not moved, and for meshes."""
+    return [pair.target.motion for pair in pairs]

@@ -69,7 +69,6 @@ class Bodies:
         dead: forces of fixed direction at all unknowns, such as forces of removed conditions, ghosts included ``(n,)``; None for zero.
         wanted: prescribed values at the unknowns with Dirichlet conditions, ghosts included ``(n,)``.
         tangent: K.
-        points: loads and springs at nodes, or None.
         inversions: search for cells turned inside out, or None.
         stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``, for estimates of rounding in forces; None until known.
     """
@@ -88,7 +87,7 @@ class Bodies:
     ):
         self.config, self.comm, self.u, self.F = config, config.comm, config.whole, F
         self.unknowns = config.unknowns
-        self.materials, self.dynamics, self.points = list(materials), dynamics, points
+        self.materials, self.dynamics = list(materials), dynamics
         self.tangent = Tangent(F, config, self.materials, dynamics, points, J)
         with compiling("the residual"):
             self._F = forms.form(F)
@@ -144,8 +143,8 @@ class Bodies:
             self.dynamics.update_rates()
         with timed("assemble residual"):
             (write or self._assemble)(self._b)
-            if self.points is not None:
-                self.points.add_forces(self._b.array)
+            if self.tangent.points is not None:
+                self.tangent.points.add_forces(self._b.array)
             if self.dead is not None:
                 self._b.array[:] -= self.dead[: self._n_owned]
             if self.dynamics is not None:

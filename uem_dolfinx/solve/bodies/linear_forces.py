@@ -34,7 +34,7 @@ def explicit_forces(bodies: Any, form: Any, J: ufl.Form | None) -> Callable[[PET
     dynamics = bodies.dynamics
     if dynamics is None or not isinstance(dynamics.scheme, CentralDifferences) or dynamics.damping is not None:
         return None
-    return LinearForces(bodies, form).assemble if bodies.linear and bodies.points is None and J is None else None
+    return LinearForces(bodies, form).assemble if bodies.linear and bodies.tangent.points is None and J is None else None
 
 
 class LinearForces:

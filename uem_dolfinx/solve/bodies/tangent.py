@@ -70,7 +70,7 @@ class Tangent:
         self.linear: bool = not any(f is u for f in self._inputs)
         if self.given:
             self.linear = self.linear and not any(f is u for f in forms.with_derivatives(derivative)[1])
-        self._dynamics, self._factor, self._points = dynamics, 0.0, points
+        self._dynamics, self._factor, self.points = dynamics, 0.0, points
         self._values: list[Array] | None = None
         with compiling("the tangent"):
             self._form = forms.form(J)
@@ -99,7 +99,7 @@ class Tangent:
 
     def take_points(self, points: Any) -> None:
         """Replace the loads and springs at nodes; K is assembled anew."""
-        self._points, self._values = points, None
+        self.points, self._values = points, None
 
     def update(self) -> None:
         """Assemble K if something that it depends on has changed (collective)."""
@@ -111,8 +111,8 @@ class Tangent:
             return
         with timed("assemble tangent"):
             forms.assemble_matrix(self.K, self._form)
-            if self._points is not None:
-                self._points.add_stiffness(self.K)
+            if self.points is not None:
+                self.points.add_stiffness(self.K)
             if self._dynamics is not None and factor:
                 self.K.axpy(factor, self._dynamics.matrix, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
             self._complete(comm)

@@ -111,7 +111,7 @@ class FloatingBodies:
     @cached_property
     def _has_springs(self) -> bool:
         """Whether springs may hold bodies: springs at nodes, or a form that depends on the values of u, not only on gradients."""
-        return self._bodies.points is not None or takes_values(self._bodies.F, self._bodies.u)
+        return self._bodies.tangent.points is not None or takes_values(self._bodies.F, self._bodies.u)
 
     def _floating(self, motions: RigidMotions) -> RigidMotions | None:
         """The motions, if neither conditions nor springs in the form hold all bodies; else None (collective)."""

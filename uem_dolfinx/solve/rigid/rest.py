@@ -44,7 +44,7 @@ class _Drag:
     """
 
     def __init__(self, problem: Any, largest: Array):
-        self._config, self._points, self._largest, self.factor = problem.config, problem.bodies.points, largest, 1.0
+        self._config, self._points, self._largest, self.factor = problem.config, problem.bodies.tangent.points, largest, 1.0
         self._unknowns = self._config.of(np.arange(len(problem.u.x.array)))[: self._config.n_owned]
         self.begin()
 
@@ -163,12 +163,11 @@ def _rest(problem: Any, converge: Callable[[], list[Any]]) -> list[Any] | None:
 def _dragged(problem: Any, drag: _Drag) -> Iterator[None]:
     """Context in which a drag holds all bodies, so that none falls."""
     bodies, floating = problem.bodies, problem.system.floating
-    points, motions = bodies.points, floating.motions
+    points, motions = bodies.tangent.points, floating.motions
     try:
         floating.motions = None
-        bodies.points = drag  # type: ignore[assignment]
         yield
     finally:
-        floating.motions, bodies.points = motions, points
+        floating.motions = motions
         bodies.tangent.take_points(points)
         problem.system.forget()
