@@ -14,15 +14,16 @@ from dolfinx import fem
 from helpers import refused, slow
 
 import uem_dolfinx as uem
+from uem_dolfinx import forms
 from uem_dolfinx.accuracy.adapt import AdaptedMesh, enough, size_factors
 
 COMM = MPI.COMM_WORLD
 
 
-def punch(size=None, degree=2, h=0.5, quads=0):
+def punch(size=None, degree=2, h=0.5, quads=0, comm=COMM):
     """A block under a rigid flat punch, whose pressure is singular at the corner."""
     parameters = {"h": h, "quads": quads}
-    mesh, tags = uem.read_gmsh(uem.example_mesh("adapt_punch"), COMM, gdim=2, parameters=parameters, size=size)
+    mesh, tags = uem.read_gmsh(uem.example_mesh("adapt_punch"), comm, gdim=2, parameters=parameters, size=size)
     V = uem.function_space(mesh, degree, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
@@ -55,11 +56,61 @@ def test_sizes_for_a_tolerance(degree, quads):
     assert 0.4 * tolerance < found.estimate.relative <= tolerance
 
 
-def test_fewer_cells_than_at_first():
+@pytest.mark.parametrize("quads, h, tolerance", [(0, 0.1, 0.035), slow(1, 0.2, 0.03)])
+def test_fewer_cells_than_at_first(quads, h, tolerance):
     """Of a fine uniform mesh most cells are merged, with a smaller error than before: fine cells far from the corner serve nothing."""
-    found = uem.adapt(lambda size: punch(size, h=0.1), tolerance=0.035)
+    found = uem.adapt(lambda size: punch(size, h=h, quads=quads), tolerance=tolerance)
     first, last = found.meshes[0], found.meshes[-1]
-    assert found.reached and last.cells < 0.1 * first.cells and last.estimate < first.estimate
+    assert found.reached and len(found.meshes) < 8 and last.cells < 0.2 * first.cells and last.estimate < first.estimate
+
+
+@pytest.mark.slow
+def test_partitions():
+    """Meshes of an adaptation have the same cells on any ranks."""
+    found = [uem.adapt(lambda size, comm=comm: punch(size, quads=1, comm=comm), tolerance=0.03) for comm in (MPI.COMM_SELF, COMM)]
+    cells, estimates = zip(*[([m.cells for m in one.meshes], [m.estimate for m in one.meshes]) for one in found])
+    assert len(cells[0]) > 1 and cells[0] == cells[1] and np.allclose(*estimates, rtol=1e-6)
+
+
+def indented(size, path):
+    """A body of any .geo file with a bottom and a top, which a rigid sphere dents."""
+    mesh, tags = uem.read_gmsh(path, COMM, gdim=3, size=size)
+    V = uem.function_space(mesh, 1, (3,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    bcs = [uem.dirichlet(V, tags["bottom"], value=(0.0, 0.0, 0.05))]
+    contact = uem.Contact(tags["top"], uem.RigidSphere((0.0, 0.0, 2.0), 1.0))
+    return uem.UnitedProblem(uem.LinearElastic(1.0, 0.3).residual(u, v) * ufl.dx, u, bcs=bcs, contacts=[contact])
+
+
+#: A cube, and a cylinder of curved cells.
+BODIES = {
+    "hexahedra": "Box(1) = {0, 0, 0, 1, 1, 1};\nMesh.SubdivisionAlgorithm = 2;\n",
+    "curved tetrahedra": "Cylinder(1) = {0, 0, 0, 0, 0, 1, 1};\nMesh.ElementOrder = 2;\n",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(BODIES))
+def test_cells_in_space(kind, tmp_path):
+    """A given number of hexahedra that Gmsh makes of tetrahedra, and of curved tetrahedra, which keep the volume of a cylinder."""
+    path, e = COMM.bcast(tmp_path) / "body.geo", 1e-3
+    if COMM.rank == 0:
+        ends = "".join(
+            f'Physical Surface("{name}") = Surface In BoundingBox {{-2, -2, {z - e}, 2, 2, {z + e}}};\n'
+            for name, z in (("bottom", 0), ("top", 1))
+        )
+        path.write_text(
+            f'SetFactory("OpenCASCADE");\n{BODIES[kind]}Mesh.MeshSizeMax = 0.6;\nPhysical Volume("body") = {{1}};\n{ends}'
+        )
+    COMM.barrier()
+    found = uem.adapt(lambda size: indented(size, path), cells=1000, meshes=6)
+    first, last = found.meshes[0], found.meshes[-1]
+    assert found.reached and len(found.meshes) <= 5 and abs(last.cells / 1000 - 1) < 0.15
+    # equal cells have errors like N^(-1/3)
+    assert last.estimate * last.cells ** (1 / 3) < 0.85 * first.estimate * first.cells ** (1 / 3)
+    mesh = found.problem.config.mesh
+    volume = COMM.allreduce(fem.assemble_scalar(forms.form(fem.Constant(mesh, 1.0) * ufl.dx)))
+    assert np.isclose(volume, 1.0 if kind == "hexahedra" else np.pi, rtol=1e-3)
 
 
 def test_a_number_of_cells():
@@ -71,7 +122,7 @@ def test_a_number_of_cells():
     assert found.estimate.relative < 0.2 * uem.error_estimate(uniform).relative
 
     def mesh(cells, estimate):
-        return AdaptedMesh(cells, 0, estimate, 1, 0.0)
+        return AdaptedMesh(cells, 0, estimate, estimate, 1, 0.0)
 
     assert enough([mesh(100, 0.1), mesh(105, 0.095)], None, 100)
     assert not enough([mesh(100, 0.1), mesh(105, 0.07)], None, 100)

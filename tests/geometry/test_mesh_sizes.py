@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 from mpi4py import MPI
 
 import basix
@@ -53,3 +55,32 @@ def test_gmsh_follows(name, gdim):
         number.append(COMM.allreduce(len(own)))
         assert 0.7 < COMM.allreduce(own.sum()) / number[-1] / (factor * usual) < 1.5
     assert 0.6 * 2**gdim < number[1] / number[0] < 1.5 * 2**gdim
+
+
+@pytest.mark.parametrize(
+    "name, order, curved", [("adapt_hertz", 1, True), ("adapt_hertz", 2, False), ("adapt_punch", None, False)]
+)
+def test_straight_cells_along_curves(name, order, curved, caplog):
+    """A line says that estimates do not see them, on meshes that follow sizes alone."""
+    options = {} if order is None else {"order": order}
+    mesh, _ = uem.read_gmsh(uem.example_mesh(name), COMM, gdim=2, parameters=options)
+    with caplog.at_level(logging.INFO, logger="uem_dolfinx"):
+        uem.read_gmsh(uem.example_mesh(name), COMM, gdim=2, parameters=options, size=MeshSizes(mesh, cell_sizes(mesh)))
+    lines = [record.getMessage() for record in caplog.records if "straight cells along Circle" in record.getMessage()]
+    assert len(lines) == (curved and COMM.rank == 0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_subdivided_cells_have_their_sizes(dim, tmp_path):
+    """Quadrilaterals and hexahedra that Gmsh makes of triangles and tetrahedra, within 20 %, as the others."""
+    path = COMM.bcast(tmp_path) / "unit.geo"
+    body = "Rectangle(1) = {0, 0, 0, 1, 1};" if dim == 2 else "Box(1) = {0, 0, 0, 1, 1, 1};"
+    if COMM.rank == 0:
+        path.write_text(f'SetFactory("OpenCASCADE");\n{body}\nMesh.SubdivisionAlgorithm = {dim - 1};\nMesh.MeshSizeMax = 0.6;\n')
+    COMM.barrier()
+    mesh, _ = uem.read_gmsh(path, COMM, gdim=dim)
+    size = (0.04, 0.14)[dim - 2]
+    finer, _ = uem.read_gmsh(path, COMM, gdim=dim, size=MeshSizes(mesh, np.full(len(cell_sizes(mesh)), size)))
+    own = cell_sizes(finer)
+    mean = COMM.allreduce(own.sum()) / COMM.allreduce(len(own))
+    assert finer.topology.dim == dim and 0.8 < mean / size < 1.2

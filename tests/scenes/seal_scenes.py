@@ -21,10 +21,10 @@ def force(F, tag, component=1):
 
 
 class Seal:
-    """A quarter of a round seal of rubber between a plate and a wall, of curved cells; ``goal`` is the force on the wall."""
+    """A quarter of a round seal of rubber between a plate and a wall, of curved cells; ``goals`` are forces on the wall."""
 
     def __init__(self, coupling="node_to_surface", wall=1.05):
-        self.coupling, self.wall, self.goals = coupling, wall, {}
+        self.coupling, self.wall, self.goals, self.on_plate = coupling, wall, {}, {}
 
     def make(self, size=None, h=0.25):
         mesh, tags = uem.read_gmsh(uem.example_mesh("adapt_seal"), MPI.COMM_WORLD, gdim=2, parameters={"h": h}, size=size)
@@ -35,7 +35,7 @@ class Seal:
         planes = uem.RigidPlane((0.0, 1.0), (0.0, -1.0)), uem.RigidPlane((self.wall, 0.0), (-1.0, 0.0))
         contacts = [uem.Contact(tags["arc"], plane, name=name, coupling=self.coupling) for name, plane in zip("pw", planes)]
         problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts)
-        self.goals[problem] = force(F, tags["symmetry"], 0)
+        self.goals[problem], self.on_plate[problem] = force(F, tags["symmetry"], 0), force(F, tags["middle"])
         return problem
 
     def solve(self, problem):

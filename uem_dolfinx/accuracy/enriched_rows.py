@@ -4,7 +4,8 @@
 
 w_c and w_t are values of a function w of that space on the contactor and at the closest point of the target. g is the gap that the
 solution leaves, and phi_i a Bernstein function of that space on the contactor. Both couplings and rigid targets get the
-same conditions; ties have one for each component.
+same conditions; ties have one for each component, and so have contactors that stick. Where contactors slip, their friction is part of the
+equation's forces, along ``n - mu s`` instead of n, with the coefficient mu and the direction of slip s.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ class EnrichedRows(NamedTuple):
         row: global number of the equation ``(k,)``.
         node: global node of the enriched space ``(k,)``.
         value: entries at its components, zero where these are prescribed ``(k, gdim)``.
+        force: the same of the forces of its multiplier, which differ from these where contactors slip with friction ``(k, gdim)``.
         gap_row: global number of the equation of each part of a gap ``(j,)``.
         gap: parts of the weighted gaps ``(j,)``.
         active: whether the solution's contactors of the rank's own equations are active ``(m,)``.
@@ -47,6 +49,7 @@ class EnrichedRows(NamedTuple):
     row: Ints
     node: Ints
     value: Array
+    force: Array
     gap_row: Ints
     gap: Array
     active: Bools
@@ -66,16 +69,17 @@ def enriched_rows(enriched: Enriched) -> EnrichedRows:
     for one in surfaces:
         count = len(one.nodes) * one.width
         parts.append(one.entries(at))
-        states.append((np.repeat(one.active, one.width), np.full(count, one.tied)))
+        states.append((np.repeat(one.active, one.width), np.repeat(one.tied, one.width)))
         at += count
     active, tied = (np.concatenate([np.zeros(0, bool), *part]) for part in (zip(*states) if states else ([], [])))
-    row, node, value, gap_row, gap = (np.concatenate(part) for part in zip(*parts))
+    row, node, value, force, gap_row, gap = (np.concatenate(part) for part in zip(*parts))
     own = np.concatenate([np.zeros(0, np.int64), *(np.repeat(one.nodes, one.width) for one in surfaces)])
-    return EnrichedRows(row, node, value, gap_row, gap, active, tied, own, first)
+    return EnrichedRows(row, node, value, force, gap_row, gap, active, tied, own, first)
 
 
 def _none(gdim: int) -> list[Any]:
-    return [np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, gdim)), np.zeros(0, np.int64), np.zeros(0)]
+    none, ints = np.zeros((0, gdim)), np.zeros(0, np.int64)
+    return [ints, ints, none, none, ints, np.zeros(0)]
 
 
 class _Surface:
@@ -84,6 +88,7 @@ class _Surface:
     Attributes:
         nodes: owned nodes of the space on it ``(n,)``.
         active: whether all contactors of a facet around them are active ``(n,)``.
+        tied: whether they are tied, or all contactors of a facet around them stick ``(n,)``.
         width: number of equations of a node.
     """
 
@@ -92,35 +97,51 @@ class _Surface:
         self.facets = facets_of(config, contact.contactor, "contactor")
         of_space: Any = SimpleNamespace(V=enriched.W, mesh=config.mesh, tdim=config.tdim, degree=enriched.degree)
         self.dofs = nodes_of_facets(of_space, contact.contactor).dofs
-        self.tied, self.width = contact.tied is not False, config.gdim if contact.tied else 1
         pair, nodes = contact.pair, enriched.nodes
-        state = np.zeros((config.n_owned, 1))
-        state[pair.nodes, 0] = pair.tied if self.tied else pair.trial.active
-        whole = self._of_nodes(state).min(axis=1, initial=1.0)
-        found = [
-            nodes.to_owners(self.dofs.ravel(), np.repeat(v, self.dofs.shape[1]))[: nodes.n_owned]
-            for v in (np.ones(len(whole)), whole)
-        ]
-        self.nodes = np.flatnonzero(found[0] > 0)
-        self.active: Bools = found[1][self.nodes] > 0
+        friction = pair.friction
+        self.width = config.gdim if contact.tied or friction is not None else 1
+        # active, stick, and mu s of contactors that slip, with their number
+        state = np.zeros((config.n_owned, config.gdim + 3))
+        state[pair.nodes, 0] = pair.tied if contact.tied else pair.trial.active
+        state[:, 1] = contact.tied is not False
+        if friction is not None:
+            slips = friction.slipping(pair.trial)
+            state[pair.nodes, 1] = friction.active(pair.trial) & ~slips
+            state[pair.nodes, 2] = slips
+            state[pair.nodes, 3:] = friction.value[:, None] * friction.directions(pair.trial)
+        of_facets = self._of_nodes(state)
+        whole = of_facets[:, :, :2].min(axis=1, initial=1.0)
+        #: Of each facet, a mean of mu s over the contactors that slip ``(m, gdim)``.
+        self.rubbing = of_facets[:, :, 3:].sum(axis=1) / np.maximum(of_facets[:, :, 2].sum(axis=1), 1.0)[:, None]
+        there, active, tied = (
+            nodes.to_owners(self.dofs.ravel(), np.repeat(v, self.dofs.shape[1]))[: nodes.n_owned] > 0
+            for v in (np.ones(len(whole)), *whole.T)
+        )
+        self.nodes = np.flatnonzero(there)
+        self.active: Bools = active[self.nodes]
+        self.tied: Bools = tied[self.nodes]
 
     def _of_nodes(self, values: Array) -> Array:
-        """Values at the displacement's owned nodes ``(n_owned, 1)``, at those of the facets ``(m, nn)`` (collective)."""
+        """Values at the displacement's owned nodes ``(n_owned, k)``, at those of the facets ``(m, nn, k)`` (collective)."""
         config, dofs = self.enriched.problem.config, self.facets.dofs
-        return np.asarray(config.from_owners(np.arange(config.n_owned), values, dofs.ravel()).reshape(dofs.shape))
+        return np.asarray(
+            config.from_owners(np.arange(config.n_owned), values, dofs.ravel()).reshape(*dofs.shape, values.shape[1])
+        )
 
     def entries(self, first: int) -> list[Any]:
         """Entries of the equations, which on this rank begin with the number ``first`` (collective)."""
         enriched, contact, facets = self.enriched, self.contact, self.facets
         config, target = enriched.problem.config, contact.pair.discretisation.target
         gdim, nodes = config.gdim, enriched.nodes
-        numbers = np.zeros((nodes.n_owned, self.width))
-        numbers[self.nodes] = first + np.arange(len(self.nodes) * self.width).reshape(-1, self.width)
+        numbers = np.zeros((nodes.n_owned, self.width + 1))
+        numbers[self.nodes, :-1] = first + np.arange(len(self.nodes) * self.width).reshape(-1, self.width)
+        numbers[self.nodes, -1] = self.tied
         at = (
             nodes.from_owners(np.arange(nodes.n_owned), numbers, self.dofs.ravel())
-            .reshape(*self.dofs.shape, self.width)
+            .reshape(*self.dofs.shape, self.width + 1)
             .astype(np.int64)
         )
+        at, tied = at[..., :-1], at[..., -1] > 0
         xi, weights = composite_rule(facets.shape.cell, 2 * enriched.degree, PIECES)
         N, n_q = facets.shape.functions(xi), len(xi)
         X = config.X[facets.dofs]
@@ -142,26 +163,34 @@ class _Surface:
         if (offset := contact.pair.discretisation.setting.offset) is not None:
             of_nodes = np.zeros((config.n_owned, 1))
             of_nodes[contact.pair.nodes, 0] = offset
-            gap = gap - (self._of_nodes(of_nodes) @ N.T).ravel()
-        directions = np.broadcast_to(np.eye(gdim), (len(gap), gdim, gdim)) if contact.tied else projection.normal[:, None]
-        gap = np.zeros((len(gap), gdim)) if contact.tied else gap[:, None]
+            gap = gap - (self._of_nodes(of_nodes)[:, :, 0] @ N.T).ravel()
         # which facet and point of the rule
         facet, point = np.divmod(np.arange(len(facets.dofs) * n_q), n_q)
+        # those of each test function's node: the normal, or all components of tied ones (points, test, direction, component)
+        tied, n = tied[facet], projection.normal
+        directions, along = (np.zeros((*tied.shape, self.width, gdim)) for _ in range(2))
+        directions[:, :, 0], along[:, :, 0] = n[:, None], (n - self.rubbing[facet])[:, None]
+        directions[tied] = along[tied] = np.eye(gdim)[: self.width]
+        gaps = np.zeros(directions.shape[:-1])
+        if not contact.tied:
+            gaps = np.where(tied[:, :, None], (gap[:, None] * n)[:, None, : self.width], 0.0)
+            gaps[:, :, 0] = np.where(tied, gaps[:, :, 0], gap[:, None])
         here = _local(enriched, facets, facet, xi[point])
         sides = [(1.0, *here)]
         if target.n_nodes:
             faceted: Any = target
             sides.append((-1.0, *_on_target(enriched, faceted.facets, projection)))
         test = area[:, None] * bernstein(facets.shape.cell, enriched.degree, xi)[point]
-        found: list[list[Any]] = [[], [], []]
+        found: list[list[Any]] = [[], [], [], []]
         for sign, there, values, free in sides:
             # (points, test, direction, node, component)
-            value = sign * np.einsum("pt,pdg,pn,png->ptdng", test, directions, values, free)
+            value, force = (sign * np.einsum("pt,ptdg,pn,png->ptdng", test, one, values, free) for one in (directions, along))
             shape = value.shape[:-1]
             found[0].append(np.broadcast_to(at[facet][:, :, :, None], shape).ravel())
             found[1].append(np.broadcast_to(there[:, None, None, :], shape).ravel())
             found[2].append(value.reshape(-1, gdim))
-        weighted = test[:, :, None] * gap[:, None, :]
+            found[3].append(force.reshape(-1, gdim))
+        weighted = test[:, :, None] * gaps
         return [*(np.concatenate(part) for part in found), at[facet].ravel(), weighted.ravel()]
 
 

@@ -1,8 +1,9 @@
 """goal_error: the error of a functional by the mesh, from a linear problem of both bodies in a space of one degree more.
 
-With the residual r of a solution u in that space, its stiffness K there, and active contacts B with their gaps g (``enriched_rows``),
+With the residual r of a solution u in that space, its stiffness K there, and active contacts B with their gaps g and forces C
+(``enriched_rows``), which are B but for friction,
 
-    [ K  B' ] [ w ]   [ -r ]          [ K  B' ]' [ z ]   [ dJ/du ]
+    [ K  C' ] [ w ]   [ -r ]          [ K  C' ]' [ z ]   [ dJ/du ]
     [ B  0  ] [ . ] = [ -g ]          [ B  0  ]  [ . ] = [   0   ]
 
 w leads to the solution of one degree more, in which contactors become active and are released as in the first one. So ``J'(w)``
@@ -19,7 +20,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, diags
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.accuracy.enriched import Enriched
@@ -27,6 +28,8 @@ from uem_dolfinx.accuracy.enriched_rows import EnrichedRows, enriched_rows
 from uem_dolfinx.accuracy.estimate import refuse_estimate
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.laws.coulomb import Coulomb
+from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.errors import InputError, LinearSolveError, MissingBackendError
 from uem_dolfinx.form_checks import check_functional
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -49,13 +52,15 @@ class GoalError:
         value: of the functional.
         error: estimate of the exact value less this one.
         rounding: part of the value that the tolerance of equilibrium leaves open.
-        cells: part of each cell in it, without sign, a Function that is constant in cells, for files and pictures.
+        parts: sum of the parts of all cells, in which errors of opposite signs do not cancel.
+        cells: part of each cell, without sign, a Function that is constant in cells, for files and pictures.
         shares: the same of this rank's cells ``(n_owned_cells,)``.
     """
 
     value: float
     error: float
     rounding: float
+    parts: float
     cells: fem.Function = field(repr=False)
     shares: Array = field(repr=False)
 
@@ -84,7 +89,8 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
         The value, the estimate, and the parts of the cells.
 
     Raises:
-        InputError, InputTypeError: for what ``error_estimate`` refuses, friction, histories, couplings and general contact.
+        InputError, InputTypeError: for what ``error_estimate`` refuses, friction other than Coulomb's, histories, couplings and general
+            contact.
         MissingBackendError: if PETSc has neither MUMPS nor SuperLU_DIST.
 
     Example:
@@ -120,7 +126,8 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
     cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="goal_error")
     cells.x.array[: len(shares)] = shares
     cells.x.scatter_forward()
-    return GoalError(float(value), float(error), problem.rtol * terms, cells, shares)
+    parts = reduced(config.comm, float(shares.sum()))
+    return GoalError(float(value), float(error), problem.rtol * terms, parts, cells, shares)
 
 
 def check_goal(problem: UnitedProblem, J: ufl.Form) -> None:
@@ -138,7 +145,10 @@ def check_goal(problem: UnitedProblem, J: ufl.Form) -> None:
             raise InputError("goal: holds nothing that the problem solves for: expected problem.u")
         for present, what in (
             (bool(problem.materials), "a law with history"),
-            (any(pair.frictional for pair in problem.pairs), "friction"),
+            (
+                any(pair.friction is not None and not _proportional(pair.friction.limits.law) for pair in problem.pairs),
+                "friction other than Coulomb's",
+            ),
             (
                 any(c.normal is not None or c.cohesion is not None or c.leak is not None for c in problem.contacts),
                 "a law of gaps",
@@ -152,6 +162,11 @@ def check_goal(problem: UnitedProblem, J: ufl.Form) -> None:
         ):
             if present:
                 raise InputError(f"the problem has {what}, which an estimate of a goal's error does not include")
+
+
+def _proportional(law: FrictionLaw) -> bool:
+    """Whether friction is a coefficient times the pressure."""
+    return isinstance(law, Coulomb) and law.most is None and law.force is None
 
 
 def _of_facets(problem: UnitedProblem, contact: Contact) -> bool:
@@ -187,28 +202,32 @@ class _System:
         i = np.repeat(np.arange(self.n), np.diff(starts))
         self._K = coo_matrix((values, (i, of_components(columns.astype(np.int64)))), shape=(self.n + m, int(first[-1]))).tocsr()
         A.destroy()
-        row, entries = np.repeat(of_rows(rows.row), g), rows.value.ravel()
+        row, entries, forces = np.repeat(of_rows(rows.row), g), rows.value.ravel(), rows.force.ravel()
         column = of_components((rows.node[:, None] * g + np.arange(g)).ravel())
-        there = Exchange.to(comm, np.where(entries != 0.0, np.searchsorted(first, row, side="right") - 1, -1))
-        at, column, entries = there.send(row, column, entries)
-        B = coo_matrix((entries, (at - first[comm.rank] - self.n, column)), shape=(m, int(first[-1]))).tocsr()
+        # zeros stay in both alike
+        there = Exchange.to(comm, np.where((entries != 0.0) | (forces != 0.0), np.searchsorted(first, row, side="right") - 1, -1))
+        at, column, entries, forces = there.send(row, column, entries, forces)
+        B, self._C = (
+            coo_matrix((one, (at - first[comm.rank] - self.n, column)), shape=(m, int(first[-1]))).tocsr()
+            for one in (entries, forces)
+        )
         self._B, layout = B, ((m, int(rows.first[-1])), (self.n + m, int(first[-1])))
         self._openings = PETSc.Mat().createAIJ(layout, csr=(B.indptr, B.indices, B.data), comm=comm)
         gap_row, gap = Exchange.to(comm, np.searchsorted(rows.first, rows.gap_row, side="right") - 1).send(rows.gap_row, rows.gap)
         self.gaps: Array = np.asarray(np.bincount(gap_row - rows.first[comm.rank], gap, m), dtype=float)
-        self.active &= np.diff(B.indptr) > 0
+        self.active &= np.asarray(abs(B).sum(axis=1)).ravel() > 0
 
     def _factorise(self) -> None:
         """Factorise with the equations that are active; others keep their multipliers at zero (collective)."""
         self.close()
-        begin, B = self.first[self.comm.rank], self._B.copy()
-        B.data *= np.repeat(self.active, np.diff(B.indptr))
-        B.eliminate_zeros()
-        B = B.tocoo()
-        rows, last = begin + self.n + B.row, begin + self.n + np.arange(len(self.active))
-        there = Exchange.to(self.comm, np.searchsorted(self.first, B.col, side="right") - 1)
-        i, j, v = there.send(B.col.astype(np.int64), rows.astype(np.int64), B.data)
-        entries = (np.concatenate([i, rows, last]) - begin, np.concatenate([j, B.col, last]))
+        begin, last = self.first[self.comm.rank], self.first[self.comm.rank] + self.n + np.arange(len(self.active))
+        B, C = (diags(1.0 * self.active) @ one for one in (self._B, self._C))
+        for one in (B, C):
+            one.eliminate_zeros()
+        B, C = B.tocoo(), C.tocoo()
+        there = Exchange.to(self.comm, np.searchsorted(self.first, C.col, side="right") - 1)
+        i, j, v = there.send(C.col.astype(np.int64), (begin + self.n + C.row).astype(np.int64), C.data)
+        entries = (np.concatenate([i - begin, self.n + B.row, last - begin]), np.concatenate([j, B.col, last]))
         values = np.concatenate([v, B.data, np.where(self.active, 0.0, 1.0)])
         whole = (self._K + coo_matrix((values, entries), shape=self._K.shape)).tocsr()
         sizes = whole.shape

@@ -236,7 +236,20 @@ def _open(gmsh: Any, path: Path, gdim: int | None, parameters: dict[str, float],
             for file, copy in copies.items():
                 found[0] = found[0].replace(str(copy), str(file))
             raise MeshError(f"Gmsh cannot read or mesh {path}{' with ' + values if values else ''}: {found[0]}")
-        return _extract(gmsh.model, gdim, str(path))
+        raw = _extract(gmsh.model, gdim, str(path))
+        if size is not None and raw.degree == 1 and (curved := _curved(gmsh.model, dim - 1)):
+            logger.info(
+                "%s: straight cells along %s: estimates do not include that error: set Mesh.ElementOrder = 2",
+                path,
+                ", ".join(curved),
+            )
+        return raw
+
+
+def _curved(model: Any, dim: int) -> list[str]:
+    """Curved curves or surfaces of a model, by their kinds and numbers."""
+    named = [(model.getType(dim, number), number) for _, number in model.getEntities(dim)]
+    return [f"{kind} {number}" for kind, number in named if not kind.startswith(("Line", "Plane", "Discrete"))]
 
 
 @contextmanager

@@ -19,11 +19,17 @@ FILLED_BY = {
 #: Sizes grow by at most this part of the way from one cell to the next, so that cells have good shapes.
 #: [convention; size over distance; test_mesh_sizes.py::test_sizes_grow_slowly]
 GROWTH = 0.5
+#: Digits of sizes, relative, by which these do not depend on the number of ranks.
+#: [bound; digits; test_adapt.py::test_partitions]
+DIGITS = 6
 #: Options of Gmsh by which other sizes would count, and values by which they do not.
 OTHERS = {
     "Mesh.MeshSizeExtendFromBoundary": 0.0, "Mesh.MeshSizeFromPoints": 0.0, "Mesh.MeshSizeFromCurvature": 0.0, "Mesh.MeshSizeMin": 0.0,
     "Mesh.MeshSizeMax": 1e22, "Mesh.MeshSizeFactor": 1.0,
 }  # fmt: skip
+#: Gmsh gives sizes to triangles and tetrahedra; quadrilaterals and hexahedra that these are subdivided into are so much smaller.
+#: [measured; size; test_mesh_sizes.py::test_subdivided_cells_have_their_sizes]
+SUBDIVIDED = 2.5
 
 
 class MeshSizes:
@@ -51,7 +57,10 @@ class MeshSizes:
         )
         self.values: Array = np.zeros((0, n_vertices))
         if mesh.comm.rank == 0:
-            self.values = graded(*_unique(numbers), self.points, sizes)
+            # the same order and the same digits on any ranks, since Gmsh makes other meshes of sizes that differ by rounding
+            order = np.lexsort(self.points.reshape(len(sizes), -1).T)
+            numbers, self.points, sizes = numbers[order], self.points[order], sizes[order]
+            self.values = np.exp(np.round(np.log(graded(*_unique(numbers), self.points, sizes)), DIGITS))
 
     @contextmanager
     def within(self, gmsh: Any) -> Iterator[None]:
@@ -71,6 +80,8 @@ class MeshSizes:
         try:
             for name, value in OTHERS.items():
                 gmsh.option.setNumber(name, value)
+            if gmsh.option.getNumber("Mesh.SubdivisionAlgorithm"):
+                gmsh.option.setNumber("Mesh.MeshSizeFactor", SUBDIVIDED)
             yield
         finally:
             for name, value in before.items():
