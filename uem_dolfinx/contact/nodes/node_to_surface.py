@@ -106,7 +106,7 @@ class NodeToSurface(OnTarget):
 
     def _asks(self, state: PairState) -> bool:
         """Whether any contactor on any rank may be near the target (collective)."""
-        return not self.setting.far.all()
+        return not all(self.setting.far)
 
     def nowhere(self, points: Array) -> NodalKinematics:
         """Kinematics of contactors at ``points (n, gdim)`` that are far from the target on all ranks, without a search."""

@@ -107,10 +107,9 @@ class Interface(Readings):
             self.set_forces(Traction(none, none, np.zeros(self.points.shape), heat=heat))
             return
         p = self.projection
-        bad = np.flatnonzero(~(np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1)))
-        error = None
-        if len(bad):
-            i = int(bad[0])
+        finite, error = np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1), None
+        if not finite.all():
+            i = int(np.argmin(finite))
             error = NotFiniteError(
                 f"{self.name_at(i)}: gap {p.gap[i]}, normal {p.normal[i]} at {self.config.describe(int(self.nodes[i]))}: "
                 "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
@@ -313,7 +312,8 @@ class Interface(Readings):
             self.tie.set_redundant(equations, redundant)
         along = np.zeros(len(self.nodes), dtype=bool)
         along[equations.contactor[equations.normal]] = redundant[equations.normal]
-        self.trial = replace(self.trial, redundant=along)
+        if (along != self.trial.redundant).any():
+            self.trial = replace(self.trial, redundant=along)
         if self.friction is not None:
             self.friction.set_redundant(equations, redundant)
 

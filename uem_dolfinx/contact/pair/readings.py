@@ -62,7 +62,7 @@ class Readings:
     @property
     def far(self) -> bool:
         """Whether it is skipped, since the surfaces are separated."""
-        return bool(self.discretisation.setting.far.all())
+        return all(self.discretisation.setting.far)
 
     def set_offset(self, offset: Array | None) -> None:
         """Set offsets ``(n,)``; contactors must be placed again (collective)."""

@@ -37,7 +37,7 @@ class InertBodies(Bodies):
     def __init__(self, bodies: Bodies, mass: Array):
         self.__dict__.update(bodies.__dict__)
         self._mass, self._b = mass, compat.create_vector(bodies.u.function_space)
-        self.materials, self.points, self.dead, self._assembled_at, self.inversions = [], None, None, None, None
+        self.materials, self.dead, self._assembled_at, self.inversions = [], None, None, None
         # lines of a node have the same columns, as in K
         g = bodies.config.gdim
         K = PETSc.Mat().createAIJ(bodies.tangent.K.getSizes(), bsize=g, nnz=g, comm=bodies.comm)
@@ -47,7 +47,7 @@ class InertBodies(Bodies):
         K.assemble()
         K.setOption(PETSc.Mat.Option.SPD, True)
         #: M over the square of the step.
-        self.tangent: Any = SimpleNamespace(K=K, linear=True, given=False, bare=None, number=0, update=lambda: None)
+        self.tangent: Any = SimpleNamespace(K=K, linear=True, given=False, bare=None, number=0, points=None, update=lambda: None)
         self.free_to: Array = np.zeros(len(mass))
         self._factor = np.zeros(0)
         self.begin(1.0, self.free_to)
