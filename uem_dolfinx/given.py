@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeGuard, TypeVar
 
 from mpi4py import MPI
 
@@ -73,6 +73,25 @@ def sentence(what: str, value: object, expected: str, remedy: str = "") -> str:
     return f"{what} = {shown(value)}: expected {expected}{'; ' if remedy else ''}{remedy}"
 
 
+def symbolic(value: Any) -> bool:
+    """Whether a value is an expression of UFL, as a Constant, or a list with one."""
+    from ufl.core.expr import Expr
+
+    return isinstance(value, Expr) or (isinstance(value, list | tuple) and any(map(symbolic, value)))
+
+
+def numbers(value: Any) -> Array:
+    """Copy of a value as an array of numbers; TypeError, as of other objects, for expressions of UFL, whose conversion never ends."""
+    if symbolic(value):
+        raise TypeError("an expression of UFL is no number")
+    return np.array(value, dtype=float)
+
+
+def function(value: Any) -> TypeGuard[Callable[..., Any]]:
+    """Whether a value is a function of users; Python calls expressions of UFL callable, too."""
+    return callable(value) and not symbolic(value)
+
+
 def number(what: str, value: Any, within: Range = FINITE) -> float:
     """A number of a range.
 
@@ -81,7 +100,7 @@ def number(what: str, value: Any, within: Range = FINITE) -> float:
         InputError: if it is out of the range.
     """
     words = sentence(what, value, within.words, within.remedy)
-    if isinstance(value, (str, bytes, bool, np.bool_)) or np.ndim(value):
+    if symbolic(value) or isinstance(value, (str, bytes, bool, np.bool_)) or np.ndim(value):
         raise InputTypeError(words)
     try:
         x = float(value)
@@ -154,7 +173,7 @@ def vector(what: str, value: npt.ArrayLike, size: int | None = None) -> Array:
     """
     expected = f"{'2 or 3' if size is None else size} finite numbers"
     try:
-        a = np.array(value, dtype=float, ndmin=1)
+        a = np.atleast_1d(numbers(value))
     except (TypeError, ValueError):
         raise InputTypeError(sentence(what, value, expected)) from None
     if value is None:

@@ -94,6 +94,8 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
     if component is not None and component not in range(size):
         raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
     n = size if component is None else 1
+    if isinstance(value, list | tuple) and given.symbolic(value):
+        value = ufl.as_vector(value)
     if isinstance(value, fem.Function) and value.ufl_shape == (size,) and n == 1 < size:
         value = value[component]
     if isinstance(value, Expr) and not isinstance(value, (fem.Function, fem.Constant)):

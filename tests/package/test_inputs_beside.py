@@ -225,3 +225,60 @@ def test_agreed_blocks():
             if COMM.rank >= COMM.size // 2:
                 raise kind(f"from rank {COMM.rank}")
         assert len(set(COMM.allgather(type(caught.value).__name__))) == 1
+
+
+@pytest.mark.parametrize("make", ["constant", "product", "in a list"])
+def test_expressions_in_place_of_numbers(make):
+    """Constants and expressions of UFL where numbers or functions are expected are refused: their conversion never ends."""
+    b = blocks(COMM, "triangle", 2, 2)
+    mesh, (x, y), plane = b.scene.mesh, (0.0, 1.0), uem.RigidPlane((0.0, 0.0), (0.0, 1.0))
+    c = fem.Constant(mesh, 0.5)
+    one = {"constant": c, "product": 2.0 * c, "in a list": c}[make]
+    scalars = [
+        lambda: uem.Contact(b.high, plane, offset=one),
+        lambda: uem.Contact(b.high, plane, friction=one),
+        lambda: uem.Contact(b.high, plane, friction=0.1, wear=one),
+        lambda: uem.Preload(b.high, b.low, force=one),
+        lambda: uem.PointSpring((x, y), one),
+        lambda: uem.RigidCoupling(b.top, (x, y), inertia=one),
+        lambda: uem.RigidCoupling(b.top, (x, y), mass=one),
+        lambda: uem.Step("a", loads={fem.Constant(mesh, 0.0): one}),
+        lambda: uem.Newton(rtol=one),
+        lambda: uem.ViscousFriction(one),
+        lambda: uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), load={fem.Constant(mesh, 0.0): one}),
+    ]
+    # Constants may be values of these
+    if make == "product":
+        scalars += [
+            lambda: uem.Equation([((x, y), (0, 1))], b=one),
+            lambda: uem.RigidCoupling(b.top, (x, y), motion=(one, None, None)),
+            lambda: uem.RigidCoupling(b.top, (x, y), moment=one),
+            lambda: uem.SoftContact(one),
+        ]
+    vectors = [
+        lambda: uem.RigidPlane((one, 0.0), (0.0, 1.0)),
+        lambda: plane.move((0.0, one)),
+        lambda: uem.PointLoad((x, y), (one, 0.0)),
+        lambda: uem.Equation([((x, y), (0, one))]),
+        lambda: uem.RigidCoupling(b.top, (x, y), force=(one, 0.0)),
+        lambda: uem.periodic(b.high, b.low, jump=(one, 0.0)),
+    ]
+    for call in vectors if make == "in a list" else scalars:
+        refused(uem.InputTypeError, "expected", call)
+
+
+def test_a_list_of_expressions_as_value():
+    """Components of a Dirichlet value may be numbers and expressions."""
+    b = blocks(COMM, "triangle", 2, 2)
+    c = fem.Constant(b.scene.mesh, 0.01)
+    bcs = [
+        *clamp(b.V, b.bottom),
+        uem.dirichlet(b.V, b.top, None, (2.0 * c, -0.01)),
+        uem.dirichlet(b.V, b.high, None, (c, c * 0.0)),
+    ]
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*bcs, uem.dirichlet(b.V, b.low, None, (c, 0.0))])
+    problem.solve()
+    for tag, value in ((b.top, (0.02, -0.01)), (b.high, (0.01, 0.0))):
+        w = fem.Function(b.V)
+        w.interpolate(lambda p: np.outer(value, np.ones(p.shape[1])))
+        assert uem.integrate(ufl.inner(b.u - w, b.u - w) * uem.ds(tag)) <= 1e-25

@@ -74,7 +74,7 @@ class PointSpring(given.Sealed):
         self.at = at
         words = "numbers that are not negative, one, one for each axis, or a symmetric matrix"
         try:
-            self._stiffness = np.array(stiffness, dtype=float)
+            self._stiffness = given.numbers(stiffness)
         except (TypeError, ValueError):
             raise InputTypeError(given.sentence("stiffness", stiffness, words)) from None
         k = np.diag(np.atleast_1d(self._stiffness)) if self._stiffness.ndim < 2 else self._stiffness

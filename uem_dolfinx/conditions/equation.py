@@ -275,7 +275,7 @@ def _of_terms(value: Ints, node: Ints, c: Array) -> GivenRows:
 
 def _rotation(turn: npt.ArrayLike) -> Array:
     try:
-        R = np.array(turn, dtype=float)
+        R = given.numbers(turn)
     except (TypeError, ValueError):
         raise InputTypeError(given.sentence("turn", turn, "a rotation matrix")) from None
     if R.ndim != 2 or R.shape[0] != R.shape[1] or not np.abs(R @ R.T - np.eye(len(R))).max() < NEAR:
@@ -285,7 +285,7 @@ def _rotation(turn: npt.ArrayLike) -> Array:
 
 def checked_value(name: str, value: Any, size: int | None) -> Any:
     """An unchanged right-hand side, after a check: ``size`` numbers, None for 1, 2 or 3."""
-    if not callable(value) or isinstance(value, fem.Constant):
+    if not given.function(value):
         values_of(name, value, size)
     return value
 
@@ -299,7 +299,7 @@ def values_of(name: str, value: Any, size: int | None) -> Array:
     words = "a finite number" if size == 1 else f"{size or '2 or 3'} finite numbers, one for each component"
     held = isinstance(value, fem.Constant)
     try:
-        array = np.array(value.value if held else value, dtype=float, ndmin=1)
+        array = np.atleast_1d(given.numbers(value.value if held else value))
     except (TypeError, ValueError):
         raise InputTypeError(given.sentence(name, value, f"{words}, a Constant, or a function of the load factor")) from None
     zero = not held and len(array) == 1 and not array.any()

@@ -64,7 +64,7 @@ class Rule:
         n, size = len(self._dofs), self.values.function_space.dofmap.bs
         shape = (n,) if size == 1 else (size, n)
         try:
-            array = np.asarray(found, dtype=float)
+            array = given.numbers(found)
             array = (
                 array if array.shape == shape else np.broadcast_to(array.reshape((*array.shape, *(1,) * (size > 1))[:2]), shape)
             )

@@ -257,11 +257,11 @@ def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:
     Raises:
         InputError, InputTypeError: if a principal moment is negative, or exceeds the sum of the others.
     """
-    if np.ndim(value) == 0:
+    if given.symbolic(value) or np.ndim(value) == 0:
         return np.eye(n_turns) * given.number("inertia", value, given.NOT_NEGATIVE)
     words = "a number" if n_turns == 1 else "a number, or a symmetric matrix of 3 rows"
     try:
-        found = np.array(value, dtype=float)
+        found = given.numbers(value)
     except (TypeError, ValueError):
         raise InputTypeError(given.sentence("inertia", value, words)) from None
     if n_turns == 1 or found.shape != (3, 3) or not np.isfinite(found).all():

@@ -204,4 +204,4 @@ class Preload(Contact):
 
 def _given(what: str, value: Any) -> Any:
     """A number or a function of the load factor; refuse all else."""
-    return value if callable(value) else given.number(what, value)
+    return value if given.function(value) else given.number(what, value)

@@ -386,11 +386,11 @@ def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], n
     config = configuration_of(V)
     n, g = config.n_owned, config.gdim
     m, error = np.zeros(0), None
-    if callable(values):
+    if given.function(values):
         values = ask_together(config.comm, "the function of nodal masses", values, config.X[:n])
     with agreed(config.comm):
         try:
-            m = np.asarray(values, dtype=float)
+            m = given.numbers(values)
         except (TypeError, ValueError):
             raise MassError(given.sentence("nodal masses", values, "numbers, or a function of positions")) from None
     if m.shape not in ((n,), (n, g)):

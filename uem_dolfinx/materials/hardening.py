@@ -167,7 +167,7 @@ def read_pairs(what: str, points: Any, expected: str) -> tuple[Array, Array]:
     """
     words = given.sentence(what, points, expected)
     try:
-        table = np.array(points, dtype=float)
+        table = given.numbers(points)
     except (TypeError, ValueError):
         raise InputTypeError(words) from None
     if table.ndim != 2 or table.shape[1:] != (2,) or not len(table) or not np.isfinite(table).all():

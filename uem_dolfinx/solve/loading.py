@@ -65,10 +65,10 @@ def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
         given.kind("load", load, bool(load), expected)
         for constant, value in load.items():
             given.kind("a name in load", constant, isinstance(constant, fem.Constant), "a Constant")
-            if not callable(value):
+            if not given.function(value):
                 _fitting(constant, value)
         return {c: value if callable(value) else np.asarray(value, dtype=float)[()] for c, value in load.items()}
-    if load is not None and (isinstance(load, Expr) or not callable(load)):
+    if load is not None and not given.function(load):
         raise InputTypeError(given.sentence("load", load, expected))
     return load if load is None or isinstance(load, ByFunction) else ByFunction(load)
 
@@ -96,7 +96,7 @@ def _fitting(constant: fem.Constant, value: Any) -> Any:
     shape = np.shape(constant.value)
     words = f"finite numbers of the shape {shape}" if shape else "a finite number"
     try:
-        array = np.asarray(value, dtype=float)
+        array = given.numbers(value)
     except (TypeError, ValueError):
         raise InputTypeError(given.sentence("the value of a Constant in load", value, words)) from None
     if array.shape != shape or not np.isfinite(array).all():

@@ -63,7 +63,7 @@ class Conductance(given.Sealed):
     ):
         from uem_dolfinx.contact.laws.constants import checked
 
-        self.h = h if callable(h) else given.number("h", h, CONDUCTANCE)
+        self.h = h if given.function(h) else given.number("h", h, CONDUCTANCE)
         self.field = given.part_number("field", field, "the temperature")
         self.temperature = temperature if temperature is None else checked("temperature", temperature, given.FINITE)
         self.friction_share = friction_share if friction_share is None else given.number("friction_share", friction_share, SHARE)

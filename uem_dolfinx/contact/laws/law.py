@@ -90,7 +90,7 @@ def as_law(friction: Any) -> FrictionLaw:
     if hasattr(friction, "limit"):
         given.kind("friction", friction, True, "a number, a function or a law")
         return cast(FrictionLaw, friction)
-    return Coulomb(friction if callable(friction) else given.number("friction", friction, given.NOT_NEGATIVE))
+    return Coulomb(given_field("friction", friction, given.NOT_NEGATIVE))
 
 
 def given_friction(friction: Any) -> Field | FrictionLaw:
@@ -198,8 +198,8 @@ def check_tied(tied: Any, offset: Any, wear: Any, friction: Any) -> None:
 
 
 def given_field(what: str, value: Any, within: given.Range = given.FINITE) -> Field:
-    """Checked user input: a number of a range or a function of position."""
-    return cast(Field, value) if callable(value) else given.number(what, value, within)
+    """Checked user input: a number of a range, a function of position or a Function."""
+    return cast(Field, value) if isinstance(value, fem.Function) or given.function(value) else given.number(what, value, within)
 
 
 def parameters(law: FrictionLaw) -> list[Any]:
@@ -298,7 +298,7 @@ def asked_at(
     found = ask_together(config.comm, words, f, places, *more)
     with agreed(config.comm):
         try:
-            value = np.array(found, dtype=float)
+            value = given.numbers(found)
         except (TypeError, ValueError):
             raise InputTypeError(given.sentence(f"{words}(x)", found, f"{n} numbers")) from None
     if more and value.ndim == 0:

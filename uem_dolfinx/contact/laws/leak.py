@@ -28,7 +28,7 @@ class Leak(given.Sealed):
     """
 
     def __init__(self, pressure: float | Callable[[float], float], inlet: Part):
-        if not callable(pressure):
+        if not given.function(pressure):
             pressure = given.number("pressure", pressure, given.NOT_NEGATIVE)
         self.pressure, self.inlet = pressure, inlet
 

@@ -34,7 +34,7 @@ class PressureTable:
         """
         words = "two or more pairs (gap, pressure), gaps in ascending order, pressures that do not increase and end with 0"
         try:
-            a = np.array(table, dtype=float)
+            a = given.numbers(table)
         except (TypeError, ValueError):
             raise InputTypeError(given.sentence("p", table, words)) from None
         fits = a.ndim == 2 and a.shape[1:] == (2,) and len(a) > 1 and bool(np.isfinite(a).all())

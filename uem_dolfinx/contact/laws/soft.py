@@ -81,8 +81,7 @@ class SoftContact(given.Sealed):
 
     def __init__(self, p: OfGap, slope: Callable[[Array], npt.ArrayLike] | None = None, *, damping: float = 0.0):
         self.damping = given.number("damping", damping, given.NOT_NEGATIVE)
-        # a Constant of UFL is callable
-        function = p if callable(p) and not isinstance(p, fem.Constant) else None
+        function = p if given.function(p) else None
         if slope is not None:
             given.kind(
                 "slope", slope, callable(slope) and function is not None, "a function of gaps, for a function p", "leave it out"

@@ -35,7 +35,7 @@ class ViscousFriction:
     timed = True
 
     def __init__(self, eta: float | Callable[..., npt.ArrayLike], *, mu: float = np.inf):
-        object.__setattr__(self, "field", eta if callable(eta) else given.number("eta", eta, given.NOT_NEGATIVE))
+        object.__setattr__(self, "field", eta if given.function(eta) else given.number("eta", eta, given.NOT_NEGATIVE))
         object.__setattr__(self, "mu", given.number("mu", mu, given.POSITIVE_OR_INFINITE))
 
     def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:

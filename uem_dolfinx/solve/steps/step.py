@@ -79,7 +79,9 @@ class Step:
         of_contacts("contacts", "True and False", Contact | GeneralContact, lambda on: given.flag(f"{of}on or off", on))
         of_contacts("friction", "coefficients or laws", Contact, given_friction)
         of_contacts("offset", "lengths or functions", Contact, lambda offset: given_field(f"{of}offset", offset))
-        of_contacts("preload", "forces", Preload, lambda f: f if f is None or callable(f) else given.number(f"{of}preload", f))
+        of_contacts(
+            "preload", "forces", Preload, lambda f: f if f is None or given.function(f) else given.number(f"{of}preload", f)
+        )
 
     def __repr__(self) -> str:
         """Its name, number of load steps, and the arguments that are set."""
