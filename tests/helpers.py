@@ -28,7 +28,7 @@ from uem_dolfinx.solve.bodies.tangent import curvature_of
 MESHES = Path(__file__).resolve().parents[1] / "meshes"
 #: Oedometric modulus over Young's modulus.
 M = oedometric()
-serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes that are told from this one's MPI")
+serial = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes without this one's MPI")
 
 
 def slow(*values: object) -> Any:
@@ -204,12 +204,12 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
 
 
 def environment(**more: str) -> dict[str, str]:
-    """For a process that is told from this one's MPI, with this checkout of the package, its demos and its tests."""
+    """For a process without this one's MPI, with this checkout of the package, its demos and its tests."""
     kept, here = outside_mpi(), Path(__file__).resolve().parents[1]
     paths = [here, here / "demos", here / "tests", here / "tests" / "scenes", *filter(None, [kept.get("PYTHONPATH")])]
     return kept | {"PYTHONPATH": os.pathsep.join(map(str, paths))} | more
 
 
 def start_process(script: str) -> subprocess.Popen[str]:
-    """A Python process of its own that runs a script, told from this one's MPI."""
+    """A Python process of its own that runs a script, without this one's MPI."""
     return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment())

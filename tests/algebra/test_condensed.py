@@ -86,7 +86,7 @@ def test_solutions_are_those_of_the_whole(name, kind, apart, curved):
             assert solves == 1 and solver.exact
             whole += P.n_equations == 0 and G is None
             assert np.abs(found - expected).max() <= EXACT * np.abs(expected).max() * np.linalg.cond(A), n
-            # forces that are told before I is solved for: right but for prescribed components
+            # forces that are known before I is solved for: right but for prescribed components
             exact = gathered_vector(K * (P.expand(dq) + c))
             free = gathered_vector(P.space.vector(P.free)) > 0
             assert np.abs((gathered_vector(asked) - exact)[free]).max() <= EXACT * np.abs(exact).max() * np.linalg.cond(A)

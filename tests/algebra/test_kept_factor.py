@@ -142,7 +142,7 @@ def test_a_factor_that_does_not_serve(values, solves):
 
 
 def test_a_factor_leaves_little():
-    """However little is asked for, a solve leaves less than 1e-3, and is not much more accurate than that."""
+    """However little is required, a solve leaves less than 1e-3, and is not much more accurate than that."""
     config, K, pc = identity(8)
     kept = KeptFactor(config)
     kept.keep(pc, united(config, []), K)

@@ -279,7 +279,7 @@ def test_facets_are_placed_once_where_they_are(comm, cell, monkeypatch):
 
 
 def test_surface_that_no_corner_comes_near(comm, monkeypatch):
-    """Facets of contactors are not oriented for corners of the target that are beside a contactor, or far away."""
+    """Facets of contactors are not oriented for corners of the target that are next to a contactor, or far away."""
     made = calls_of(monkeypatch, TargetFacets, "__init__")
     for overhang in (0.0, 0.5):
         b = blocks(comm, "quadrilateral", overhang=overhang)

@@ -117,7 +117,7 @@ def test_as_scipy_eliminates():
 
 
 def test_values_between_steps():
-    """A number is ramped, a Constant as well unless the load sets it, and a function is asked for each load factor."""
+    """A number is ramped, a Constant as well unless the load sets it, and a function is evaluated at each load factor."""
     c = Cell()
     clamped = clamp(c.V, c.left)
     ramped, loaded = fem.Constant(c.scene.mesh, 0.02), fem.Constant(c.scene.mesh, 0.0)

@@ -154,7 +154,7 @@ def test_conditions_are_replaced():
 
 @pytest.mark.parametrize("large", [False, True])
 def test_what_is_refused(large):
-    """Values that contradict each other, and equations with prescribed nodes alone beside those of rigid parts, are named."""
+    """Values that contradict each other, and equations with prescribed nodes alone together with those of rigid parts, are named."""
     law, r = st_venant if large else linear, Row(n=1)
     rows = [r.equation(((x, 0.0), (i, 1.0)), b=b) for x, i, b in ((0.0, 0, 0.0), (0.0, 1, 0.0), (2.0, 1, 0.1), (2.0, 1, 0.2))]
     refused(uem.ConflictError, ("equations[", "missed by"), r.problem([r.part(0)], rows, law=law).solve)

@@ -74,7 +74,7 @@ def test_an_affine_field_by_every_kind_of_value(kind, degree):
 
 @pytest.mark.parametrize("way", [lambda s: s**2, lambda s: np.sin(7 * s)])
 def test_values_follow_the_load_factor(way):
-    """Along any way, beside conditions that are ramped; a function without a load factor is ramped."""
+    """Along any way, with conditions that are ramped; a function without a load factor is ramped."""
     _, V, (left, right, bottom, top) = square()
     u = fem.Function(V)
     bcs = [uem.dirichlet(V, left, 0), uem.dirichlet(V, right, 0, lambda x, s: 0.01 * way(s) + 0 * x[0])]

@@ -261,7 +261,7 @@ def test_supports_of_rigid_bodies():
     n = problem.config.n_owned
     left = rigid.left(np.ones((n, 2), dtype=bool))
     pins = motions.supports(motions.open_motions(None), UnitingEquations.join([], 2), left)
-    # the third motion is the coupling's own, which the two components beside that one tell
+    # the third motion is the coupling's own, which the other two components determine
     assert COMM.allreduce(left.sum()) == 2 and COMM.allreduce((pins & left).sum()) == COMM.allreduce(pins.sum()) == 2
 
 

@@ -72,7 +72,7 @@ def test_two_ranks_decide_as_one(active, lam, gap, parts, alone):
 
 
 def by_brute_force(M, q):
-    """Sets of six contactors whose ``lam = -M^-1 q`` on them and ``gap = M lam + q`` beside them are no less than zero."""
+    """Sets of six contactors whose ``lam = -M^-1 q`` on them and ``gap = M lam + q`` elsewhere are no less than zero."""
     for bits in range(2 ** len(q)):
         active = (bits >> np.arange(len(q))) % 2 == 1
         lam = np.zeros(len(q))
@@ -126,7 +126,7 @@ def test_linear_complementarity_is_solved(entries, load, first, share, turn):
     mu=st.floats(0.0, 3.0),
 )
 def test_all_others_come_to_an_end(entries, load, first, mu):
-    """Where there is no answer, or there are several, an answer or a circle is told after a few dozen exchanges."""
+    """Where there is no answer, or there are several, an answer or a circle is found after a few dozen exchanges."""
     M = entries @ entries.T + 0.1 * np.eye(6) + mu * entries
     lam, rules, number = settle(M, load, first)
     if lam is not None:

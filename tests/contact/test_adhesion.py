@@ -1,4 +1,4 @@
-"""Adhesion: an attraction by the gap beside hard contact.
+"""Adhesion: an attraction by the gap in addition to hard contact.
 
 The test to read first is ``test_pull_off_of_a_sphere``.
 """

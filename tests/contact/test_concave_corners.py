@@ -1,6 +1,6 @@
 """Bodies driven into concave corners of any opening: no contactor ends behind a flank, and flanks push and do not pull.
 
-The test to read first is ``test_a_wedge_in_a_groove``; how deep contactors are is told from the boundary of the bodies alone
+The test to read first is ``test_a_wedge_in_a_groove``; how deep contactors are follows from the boundary of the bodies alone
 (``corner_scenes.depth``).
 """
 
@@ -35,7 +35,7 @@ def loaded(s: InCorner, steps: int = 1, deep: float = 1e-12) -> np.ndarray:
 
 @pytest.mark.parametrize("angle", [20.0, 60.0, 80.0, 90.0, 92.0, 140.0, 179.0])
 def test_a_wedge_in_a_groove(angle):
-    """It comes down beside the bottom, or touches there and is pushed aside: the force is one that both flanks push with."""
+    """It comes down at a side of the bottom, or touches there and is pushed aside: the force is one that both flanks push with."""
     half = np.radians(angle / 2)
     aside = min(0.01, 0.005 * np.tan(half))
     for shift, push, steps in (((aside, 0.02), (0, -0.07), 1), ((-aside, 0.1), (0, -0.15), 3), ((0, 0), (0.03, -0.05), 1)):
@@ -50,7 +50,7 @@ def test_a_wedge_in_a_groove(angle):
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
 @pytest.mark.parametrize("degree", [1, 2])
 def test_a_wedge_of_other_cells_in_a_groove(cell, degree):
-    """At degree 2 the boundary's straight pieces are a little beside it."""
+    """At degree 2 the boundary's straight pieces are a little off it."""
     for angle in (40.0, 90.0):
         s = groove(cell, angle, angle / 2, angle / 4, (0.01, 0.02), (0.0, -0.07), degree=degree)
         assert loaded(s, deep=1e-12 if degree == 1 else 1e-5)[1] > 1e-3
@@ -95,7 +95,7 @@ def test_a_wedge_that_friction_would_lock(friction):
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("angle", [30.0, 90.0])
 def test_a_keel_in_a_groove(cell, angle):
-    """In space, pushed aside and along: bilinear facets are a little beside the boundary's pieces."""
+    """In space, pushed aside and along: bilinear facets are a little off the boundary's pieces."""
     s = groove(cell, angle, angle / 2, angle / 4, (0.01, 0.02, 0.01), (0.0, -0.07, 0.03), n=1)
     assert loaded(s, deep=1e-6)[1] > 1e-3
 

@@ -171,7 +171,7 @@ def test_which_edges_are_pointed(slope, expected):
 
 @pytest.mark.parametrize("part, expected", [(0.02, 1), (0.2, 0)])
 def test_who_is_left_out(part, expected):
-    """A contactor beside a corner, at a part of its facet, is left to the equation of the corner; one farther away has its own."""
+    """A contactor near a corner, at a part of its facet, is left to the equation of the corner; one farther away has its own."""
     n = 8
     h = 1.0 / n
     (_, contact, _), _ = punch(w=4 * h + part * h, n=n, corners=True)

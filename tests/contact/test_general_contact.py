@@ -1,4 +1,4 @@
-"""All surfaces against each other by one declaration: as hand-declared pairs, stacks and corners of many bodies, what is told of them.
+"""All surfaces against each other by one declaration: as hand-declared pairs, stacks and corners of many bodies, their warnings.
 
 Three tests to read first: ``test_as_declared_by_hand``, ``test_discs_in_motion`` and ``test_uniform_strain_in_a_grid``.
 """

@@ -1,4 +1,4 @@
-"""General contact: who may touch whom, what is told of bodies that touch, runs in steps, and what is refused.
+"""General contact: who may touch whom, results of bodies that touch, runs in steps, and what is refused.
 
 Two tests to read first: ``test_forces_and_moments_balance`` and ``test_going_on_from_a_checkpoint``.
 """
@@ -112,7 +112,7 @@ def test_only_some_surfaces():
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize("mu", [0.0, 0.3])
 def test_rigid_surfaces(cell, mu):
-    """As contacts of all surfaces with each; told by their names, numbered if there are several."""
+    """As contacts of all surfaces with each; by their names, numbered if there are several."""
     g, found = dimension(cell), []
     b = Bodies(cell, [box(cell, [0.0] * g, [1.0] * g, [3] * g)])
     normals = [np.eye(g)[-1], np.eye(g)[0]]
@@ -154,7 +154,7 @@ MIDDLES = [[0.0, 0.0], [0.95, 0.0], [0.475, 0.95 * np.sqrt(0.75)]]
 
 @pytest.mark.parametrize("mu", [0.0, 0.2])
 def test_forces_and_moments_balance(mu):
-    """Over all bodies they sum to none, about any point; what is told of pairs adds up to what holds each body."""
+    """Over all bodies they sum to none, about any point; forces of pairs add up to what holds each body."""
     b = Bodies("quadrilateral", [ball("quadrilateral", m, 0.5, 3) for m in MIDDLES], law=st_venant)
     cores = [fem.locate_dofs_geometrical(b.V, lambda x, m=m: np.hypot(x[0] - m[0], x[1] - m[1]) < 0.2) for m in MIDDLES[:2]]
     push = fem.locate_dofs_geometrical(b.V, lambda x: np.hypot(x[0] - MIDDLES[2][0], x[1] - MIDDLES[2][1]) < 0.2)

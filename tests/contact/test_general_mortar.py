@@ -83,7 +83,7 @@ def test_excluded_parts_do_not_touch():
 
 @pytest.mark.parametrize("first", [0, 1])
 def test_forces_of_pairs_count_contactors_that_are_not_active(first):
-    """A narrow stiff block on a wide soft one, of degree 2: rows have contactors beside their own in them, which bear forces as well."""
+    """A narrow stiff block on a wide soft one, of degree 2: rows contain other contactors too, which bear forces as well."""
     cell = "quadrilateral"
     s = scene(COMM, cell, [box(cell, [-1, 0], [1, 1], [9, 5]), box(cell, [-0.4, 1], [0.4, 1.5], [5, 3])])
     u = fem.Function(compat.function_space(s.mesh, 2, (2,)))

@@ -113,7 +113,7 @@ def test_discs_in_motion(mu, monkeypatch):
 
 
 def stacks(n, gap=0.0, mu=0.0, **how):
-    """Blocks beside each other, each on a wider one of its own, with a contact each that is named by its number."""
+    """Blocks next to each other, each on a wider one of its own, with a contact each that is named by its number."""
     every = [
         box("quadrilateral", [2.0 * k + left, low], [2.0 * k + right, high], [2, 2])
         for k in range(n)
@@ -291,7 +291,7 @@ def test_no_references_in_circles():
 
 
 def test_friction_that_follows_a_temperature_is_not_joined():
-    """Its values are asked for at each placement, by each contact; Coulomb's that only differ in values are joined."""
+    """Its values are evaluated at each placement, by each contact; Coulomb's that only differ in values are joined."""
 
     def joins(friction):
         return joining._joins(SimpleNamespace(limits=SimpleNamespace(law=as_law(friction)), wear=None))

@@ -123,7 +123,7 @@ def test_joint(coupling):
         by = j.lift.value / (a + b + s) if part < 1 else opens / (a + b + s) + (part - 1) * opens / (a + b)
         assert j.carried == pytest.approx([left + a * by, 0.02 + b * by], rel=1e-12)
         assert j.seat.n_active == (2 if part < 1 else 0)
-    # tightened again it is free, and carries what it is told to
+    # tightened again it is free, and carries the given force
     A.tighten(0.05)
     j.problem.solve()
     assert not A.locked and B.locked and A.carried == pytest.approx(0.05, rel=1e-12)

@@ -201,7 +201,7 @@ def test_one_facet_across(degree, friction):
     run(problem)
     plane = slab([0.0], FLAT, **how)
     force = contact.resultant().force
-    # quadratic quadrilaterals have the middle nodes of the plane's facets and those beside them
+    # quadratic quadrilaterals have the middle nodes of the plane's facets and their neighbours
     assert force == pytest.approx(0.25 * np.array([plane[1][0], 0.0, plane[1][1]]), abs=1e-9)
     assert contact.max_pressure() == pytest.approx(plane[1][3], rel=1e-9)
 

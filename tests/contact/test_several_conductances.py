@@ -23,7 +23,7 @@ KINDS = {"triangle": "plane_strain", "quadrilateral": "plane_strain", "tetrahedr
 
 
 class Joint:
-    """Guided blocks that are pressed on each other, with a temperature and a potential beside the displacement; all is linear in height.
+    """Guided blocks that are pressed on each other, with a temperature and a potential as further fields; all is linear in height.
 
     Args:
         contacts: makes them from the blocks.

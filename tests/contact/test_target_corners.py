@@ -1,4 +1,4 @@
-"""Convex corners of a target that enter the contactors' facets, where nodes do not see them: told of with the place, and no others.
+"""Convex corners of a target that enter the contactors' facets, where nodes do not see them: warnings with the place, and of no others.
 
 Worth reading first: ``test_corners_that_are_told`` and ``test_harmless_scenes``.
 """
@@ -22,7 +22,7 @@ COMM = MPI.COMM_WORLD
 
 
 def told(caplog):
-    """What rank 0 was told of corners, on all ranks."""
+    """Warnings of corners on rank 0, on all ranks."""
     return COMM.bcast([r.getMessage() for r in caplog.records if "a convex corner of the target" in r.getMessage()])
 
 
@@ -109,7 +109,7 @@ def test_harmless_scenes(name, caplog):
 
 
 def test_a_corner_that_is_dragged(caplog):
-    """Without friction the drag vanishes; the slab's nodes leave some of it, and it is told why. The die's nodes, with mortar, do not."""
+    """Without friction the drag vanishes; the slab's nodes leave some, and a warning says why. The die's nodes, with mortar, do not."""
     assert np.abs(ironing(1)).max() > 0.08 and len(told(caplog)) == 1
     caplog.clear()
     assert np.abs(ironing(1, swap=True, coupling="mortar")).max() < 0.03 and not told(caplog)

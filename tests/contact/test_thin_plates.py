@@ -37,7 +37,7 @@ MORE = [("triangle", 1, 1e3), ("tetrahedron", 1, 1.0), ("hexahedron", 2, 1e3), (
 )
 @pytest.mark.parametrize("over", [0.0, 0.1])
 def test_a_stack_of_thin_plates(cell, cells, unit, coupling, over):
-    """Held at both ends it is pressed by the overlap alone, and by a settlement beside it: the strain of a rod, with E = 1."""
+    """Held at both ends it is pressed by the overlap alone, and by a settlement in addition: the strain of a rod, with E = 1."""
     count = 2 if over else 3
     bodies = plates(cell, cells, over, unit, count)
     b = Bodies(cell, bodies, nu=0.0)

@@ -196,7 +196,7 @@ def test_tangent(cell, degree, coupling):
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron", slow("quadrilateral"), slow("hexahedron")])
 @pytest.mark.parametrize("n", [(1, 1), (3, 2)])
 def test_conditions_on_tied_nodes(cell, coupling, n):
-    """Rollers that hold contactors and targets beside each other: tension passes without a part of it going into the rollers."""
+    """Rollers that hold contactors and targets next to each other: tension passes without a part of it going into the rollers."""
     b = blocks(COMM, cell, *n)
     contact = uem.Contact(b.high, b.low, coupling=coupling, tied=True)
     problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=b.oedometer(-0.02), contacts=[contact])

@@ -1,4 +1,4 @@
-"""Ties from step to step: tied after contact, beside contact, in dynamics, and from checkpoints.
+"""Ties from step to step: tied after contact, together with contact, in dynamics, and from checkpoints.
 
 The test to read first: ``test_tied_from_a_step_on`` (pressed, tied where it is, and hung up).
 """

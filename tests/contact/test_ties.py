@@ -23,7 +23,7 @@ MU = 0.3
 
 @dataclass
 class Pushed:
-    """A block, pressed down by its top onto a wider one or onto a plane, and what is asked of it."""
+    """A block, pressed down by its top onto a wider one or onto a plane, and what is measured."""
 
     blocks: Blocks
     problem: uem.UnitedProblem

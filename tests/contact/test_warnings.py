@@ -1,4 +1,4 @@
-"""What a user is told of: facets that cannot follow a curve, and contactors that slide off the end of a target.
+"""What warnings name: facets that cannot follow a curve, and contactors that slide off the end of a target.
 
 Worth reading first: ``test_surfaces_that_conform`` and ``test_contactors_that_slip_off``.
 """
@@ -69,7 +69,7 @@ def test_surfaces_that_conform(hole_first, part, expected, size, caplog):
 
 @pytest.mark.parametrize("kind", ["same nodes", "3D"])
 def test_surfaces_that_conform_otherwise(kind, caplog):
-    """Surfaces with the same nodes touch alike however their facets sag; in 3D it is told as in the plane."""
+    """Surfaces with the same nodes touch alike however their facets sag; in 3D a warning names it as in the plane."""
     pin_in_hole(0.3 * SAG, 10 if kind == "same nodes" else 25, 10, g=3 if kind == "3D" else 2)
     assert told(caplog, "the surfaces conform") == (kind == "3D")
 
@@ -172,7 +172,7 @@ def bulging(n, overhang=0.0):
 
 
 def slipping(n, part):
-    """A block whose bottom is as wide as its target, pulled beside the target's end by a part of a facet."""
+    """A block whose bottom is as wide as its target, pulled past the target's end by a part of a facet."""
     b = blocks(COMM, "quadrilateral", n, n)
     contact = uem.Contact(b.high, b.low)
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=(part / n, -1e-3))]

@@ -218,7 +218,7 @@ def test_massless_contactors_have_no_velocity_of_their_own():
 
 @pytest.mark.slow
 def test_instants_are_found():
-    """A step begins at the touch and at the departure, to the tolerance asked for; departures converge with the steps."""
+    """A step begins at the touch and at the departure, to the given tolerance; departures converge with the steps."""
 
     def instants(dt, tolerance=1e-4):
         bar = Bar(50, v=-10.0)

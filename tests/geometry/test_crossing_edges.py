@@ -1,4 +1,4 @@
-"""Sharp edges that cross between their nodes: told after every step, with the place; two roofs on each other, ridge over ridge.
+"""Sharp edges that cross between their nodes: a warning after every step, with the place; two roofs on each other, ridge over ridge.
 
 Read first: ``test_ridge_over_ridge``.
 """

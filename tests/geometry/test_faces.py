@@ -28,7 +28,7 @@ def test_opposite_sides_of_a_box(cell, shuffle):
 
 
 def test_a_round_body_is_one_face():
-    """Its facets are of one class, beside those of a box; surfaces are made of classes that have any of the facets asked for."""
+    """Its facets are of one class, next to those of a box; surfaces are made of classes with any of the given facets."""
     _, skin = skin_of("quadrilateral", [box("quadrilateral", (0, 0), (1, 1), (2, 2)), ball("quadrilateral", (3.0, 0.5), 0.5, 3)])
     found, count = classes_of_facets(skin)
     assert count == 2 and COMM.allreduce(int((found[skin.body == 1] != 0).sum())) == 0

@@ -128,7 +128,7 @@ def test_lists_are_what_a_loop_finds(cell, degree, seed):
     for moved in (False, True):
         if moved:
             drawn(skin, count, seed)
-        # by motion, or asked for anew
+        # by motion, or made anew
         n._made_at = None
         n.update()
         found, total = listed(n), 0
@@ -347,7 +347,7 @@ def test_trial_states_far_away_and_back():
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("lean,faced", [(-0.4, False), (0.3, False), (1.0, True)])
 def test_who_faces_whom(degree, lean, faced):
-    """A wall beside a level face holds nodes of it only if it leans over them by more than 30 degrees."""
+    """A wall next to a level face holds nodes of it only if it leans over them by more than 30 degrees."""
     low = box("quadrilateral", [0.0, 0.0], [2.0, 1.0], [8, 4])
     wall = box("quadrilateral", [1.02, 1.02], [1.52, 2.02], [2, 8])
     wall = wall.mapped(lambda x: x - np.column_stack([lean * (x[:, 1] - 1.02), np.zeros(len(x))]))

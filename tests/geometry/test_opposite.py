@@ -84,7 +84,7 @@ def test_candidates_against_all_pairs(monkeypatch, gap, angle):
 @pytest.mark.parametrize("cell", ["triangle", pytest.param("hexahedron", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e3])
 def test_how_thick_a_plate_is(cell, unit):
-    """Whatever it is cut into, and no more than asked for; what is in front of facets, as another plate, counts for nothing."""
+    """Whatever it is cut into, and no more than that; what is in front of facets, as another plate, counts for nothing."""
     t, g = 0.01, 2 if cell == "triangle" else 3
     body = [box(cell, [0.0] * (g - 1) + [z], [1.0] * (g - 1) + [z + t], [3] * (g - 1) + [2]) for z in (0.0, 1.5 * t)]
     s = scene(MPI.COMM_WORLD, cell, body, pose=lambda x: unit * x)

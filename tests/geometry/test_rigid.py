@@ -130,7 +130,7 @@ def waves(g, hessian, name):
 @pytest.mark.parametrize("name", ["places", "three components", "rows of places", "points", "elementwise"])
 @pytest.mark.parametrize("hessian", [True, False])
 def test_functions_of_places(name, hessian):
-    """As friction's they get x of shape ``(3, n)``, however many places there are; of points ``(n, gdim)`` they are told apart."""
+    """As friction's they get x of shape ``(3, n)``, however many places there are; they are distinguished from points ``(n, gdim)``."""
     for g in (2, 3):
         for n in (4, 3, 2, 1, 7):
             points = np.random.default_rng(n).uniform(-1, 1, (n, g))

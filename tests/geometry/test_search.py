@@ -62,7 +62,7 @@ def all_facets(target):
 
 
 def points_about(g, n, seed):
-    """Points above, below and beside the unit box's top; each rank has its own."""
+    """Points above, below and at the side of the unit box's top; each rank has its own."""
     rng = np.random.default_rng(seed + 100 * COMM.rank)
     return rng.uniform(-0.3, 1.3, (n + 3 * COMM.rank, g))
 

@@ -1,4 +1,4 @@
-"""Surfaces of many bodies as one: whose each facet is, edges round which no facet reaches, normals beside them, who follows whom.
+"""Surfaces of many bodies as one: whose each facet is, edges round which no facet reaches, normals next to them, who follows whom.
 
 Two tests to read first: ``test_which_edges_are_sharp`` and ``test_the_finer_follows``.
 """

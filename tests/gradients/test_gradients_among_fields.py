@@ -1,4 +1,4 @@
-"""Gradients of problems whose displacement has a pressure or a temperature beside it: against differences, and forward against adjoint."""
+"""Gradients of problems with a pressure or a temperature as a further field: against differences, and forward against adjoint."""
 
 from types import SimpleNamespace
 

@@ -416,7 +416,7 @@ def test_refused(what, monkeypatch):
 
 
 def test_pressures_of_ties():
-    """Pressures beside a tie have derivatives, those of a tie itself have none."""
+    """Pressures next to a tie have derivatives, those of a tie itself have none."""
     s, _ = scene("tie")
     s.solve()
     J = s.problem.contacts[0].pressure * uem.ds(s.b.high) + s.u[0] * ufl.dx
@@ -424,7 +424,7 @@ def test_pressures_of_ties():
 
 
 def test_pressures_with_equations_and_couplings():
-    """Of second order, with rows of users beside those of the contact."""
+    """Of second order, with rows of users in addition to those of the contact."""
     for what, names in (("equation", ("E", "b of the equation")), ("coupling, led", ("E", *MOTION))):
         s, _ = scene(what)
         s.solve()

@@ -51,7 +51,7 @@ def test_heated_and_cooled_between_walls(comm):
 
 
 class Pressed:
-    """Two blocks that flow under each other's pressure and friction, by themselves or beside a temperature."""
+    """Two blocks that flow under each other's pressure and friction, by themselves or with a temperature."""
 
     def __init__(self, law: Any, displacement: int | None = None):
         b = blocks(COMM, "quadrilateral", 2, 3, overhang=0.5)

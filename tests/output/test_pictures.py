@@ -223,7 +223,7 @@ def test_a_field_that_is_the_same_everywhere():
 
 
 def frames(path):
-    """How many frames a film has, told by rank 0."""
+    """How many frames a film has, by rank 0."""
     from PIL import Image
 
     COMM.barrier()

@@ -136,7 +136,7 @@ def test_other_numbers_of_ranks(folder):
 
 
 def test_shapes(folder):
-    """Hoop strains are kept, as the third component of tensors, and shapes are as asked for."""
+    """Hoop strains are kept, as the third component of tensors, and shapes are as given."""
     s = scene(COMM, "triangle", [box("triangle", [0.0, 0.0], [1.0, 1.0], [2, 2])])
     V = uem.function_space(s.mesh, 1, (2,))
     u = fem.Function(V)

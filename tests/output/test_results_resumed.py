@@ -114,7 +114,7 @@ def volume(x):
 
 
 def test_results_of_earlier_runs_are_kept(folder, caplog):
-    """Every run with the same name finds its place, whatever stands beside; what has no step in it is no loss."""
+    """Every run with the same name finds its place, whatever other files there are; what has no step in it is no loss."""
     problem = pressed(COMM, "triangle")
     uem.ResultsWriter(folder / "run", problem).close()
     for name in ("run_of_another.csv", "run.1.txt"):

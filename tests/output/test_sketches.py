@@ -249,7 +249,7 @@ def test_sections_that_carry_a_force():
 
 
 def test_other_fields():
-    """Where a pressure beside the displacement is prescribed, and what of the displacement."""
+    """Where a pressure is prescribed, and what of the displacement."""
     s, _, _, left, right = bar()
     W = uem.function_space(s.mesh, [("Lagrange", 1, (2,)), 1])
     w, (v, q) = fem.Function(W), ufl.TestFunctions(W)

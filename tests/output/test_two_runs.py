@@ -1,4 +1,4 @@
-"""Two runs with one name for their results: each keeps all of its own, or is told by name; nothing is lost, mixed or overwritten.
+"""Two runs with one name for their results: each keeps all of its own, or is refused by name; nothing is lost, mixed or overwritten.
 
 Read ``test_both_keep_all_of_their_own`` first.
 """

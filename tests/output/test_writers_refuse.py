@@ -12,7 +12,7 @@ import uem_dolfinx as uem
 
 @pytest.mark.parametrize("in_time", [False, True], ids=["load", "time"])
 def test_a_step_of_another_problem(in_time, folder):
-    """It would be told with a time at which this one never was."""
+    """It would be written with a time at which this one never was."""
     one, begin = five_steps(in_time, nothing)
     other, _ = five_steps(in_time, nothing)
     step = next(iter(begin(None)))

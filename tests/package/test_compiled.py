@@ -15,7 +15,7 @@ from uem_dolfinx import compat, compiled, forms
 
 @pytest.fixture
 def looked_up(monkeypatch):
-    """What DOLFINx has been asked to compile or to find in its cache, in a process that has compiled nothing yet."""
+    """What DOLFINx compiles or finds in its cache, in a process that has compiled nothing yet."""
     asked, compile_anew = [], jit.ffcx_jit
 
     def ffcx_jit(comm, what, *args, **options):

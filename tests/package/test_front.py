@@ -68,7 +68,7 @@ def test_tutorial(folder, monkeypatch):
 
 @pytest.mark.slow
 def test_viscoelastic_page():
-    """A spring beside a spring and a dashpot, squeezed steadily: the force to the first order of the steps' length."""
+    """A spring parallel to a spring and a dashpot, squeezed steadily: the force to the first order of the steps' length."""
     page = (REPO / "demos" / "site" / "howto" / "own_residuals.md").read_text(encoding="utf-8")
     errors = []
     for n in (40, 80):
@@ -113,7 +113,7 @@ def test_reference():
 
 
 def first_run(folder, ranks, **environment):
-    """A script with an empty cache of compiled forms, told from this MPI."""
+    """A script with an empty cache of compiled forms, without this MPI."""
     script = folder / "script.py"
     script.write_text(
         README.replace('"h": 0.01', '"h": 0.1').partition("contact =")[0] + "uem.integrate(u[0] * uem.ds(tags['disc_top']))"
@@ -263,7 +263,7 @@ def test_what_names_no_surface():
 
 
 def test_measures():
-    """Areas of overlapping surfaces, alone, together in one form, and beside measures over everything and of the user's."""
+    """Areas of overlapping surfaces, alone, together in one form, and with measures over everything and of the user's."""
     b = blocks(COMM, "triangle", 2, 4, gap=0.5)
     mesh, one = b.scene.mesh, fem.Constant(b.scene.mesh, PETSc.ScalarType(1.0))
     both, low, high, left = [b.low, b.high], b.low, b.high, b.scene.tag("left", 0, at(0, 0.0))

@@ -1,4 +1,4 @@
-"""What the code as a whole keeps to: imports that point one way, short files, versions in one place, thresholds that are told and tested.
+"""What the code as a whole keeps to: imports that point one way, short files, versions in one place, documented and tested thresholds.
 
 The test to read first is ``test_thresholds_are_told``.
 """
@@ -136,7 +136,7 @@ def members(module, *names):
 
 
 def arrows(top):
-    """Pairs of folders, or files beside them, within a room of which one imports from the other."""
+    """Pairs of folders, or of files, within a room of which one imports from the other."""
     first = {name: name.removeprefix(f"{top}.").split(".")[0] for name in package() if name.startswith(f"{top}.")}
     return {
         (first[a], first[b]) for a, found in package().items() if a in first for b in found & first.keys() if first[a] != first[b]
@@ -264,7 +264,7 @@ def asks_for_a_version(node):
 
 
 def test_versions_are_asked_for_in_compat_alone():
-    """Nowhere else in the package, the demos and the tests; what was measured where is told by ``demos/benchmarks/measure.py``."""
+    """Nowhere else in the package, the demos and the tests; ``demos/benchmarks/measure.py`` says what was measured where."""
     asking = set()
     for path in python_files("uem_dolfinx", "demos", "tests"):
         if any(map(asks_for_a_version, ast.walk(ast.parse(path.read_text(encoding="utf-8"))))):

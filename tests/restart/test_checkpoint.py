@@ -1,6 +1,6 @@
 """Checkpoints: whatever is written on some ranks is read on others to the last bit, and a run goes on as if it had never stopped.
 
-Two tests to read first: ``test_any_ranks_to_any_ranks`` (random values of every kind of Function, told by their places alone) and
+Two tests to read first: ``test_any_ranks_to_any_ranks`` (random values of every kind of Function, by their places alone) and
 ``test_going_on_is_not_having_stopped`` (bit for bit in serial).
 """
 
@@ -151,7 +151,7 @@ def facets_told(target):
 
 
 def random_state(pair, seed):
-    """A state that depends on the contactors' places alone, with facets told by theirs."""
+    """A state that depends on the contactors' places alone, with facets by theirs."""
     g, middles = pair.config.gdim, facets_told(pair.target)
     r = noise(pair.config.X[pair.nodes], 5 + 2 * g, seed)
     by_place = np.append(np.lexsort(np.round(middles, 6).T), -1)

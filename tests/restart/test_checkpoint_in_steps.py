@@ -102,7 +102,7 @@ def test_one_number_between_steps(folder, monkeypatch):
 
 
 def test_sigterm_on_one_rank_ends_all(folder):
-    """One rank is told to end: all write the step they are at and leave with 143; afterwards the signal is whose it was."""
+    """One rank gets a signal to end: all write the step they are at and leave with 143; afterwards the signal is whose it was."""
     before, heard = signal.getsignal(signal.SIGTERM), []
     signal.signal(signal.SIGTERM, lambda *what: heard.append(what))
     try:

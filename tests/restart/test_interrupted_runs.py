@@ -316,7 +316,7 @@ def test_table_that_cannot_be_written(resume, folder):
 
 
 def test_tables_go_on(folder, caplog):
-    """Half a row goes, what is later goes, another table is refused and stays, and a hole is told about."""
+    """Half a row goes, what is later goes, another table is refused and stays, and a warning names a hole."""
 
     def create(columns, at):
         return CsvTable(folder / "t.csv", COMM, columns, at)

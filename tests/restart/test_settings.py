@@ -1,4 +1,4 @@
-"""Runs that go on with something else than they began with are told what it is; so are what differs between ranks, and lost times.
+"""Runs that go on with something else than they began with name it; so are what differs between ranks, and lost times.
 
 Read ``test_other_settings_are_named`` first.
 """

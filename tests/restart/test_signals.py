@@ -95,7 +95,7 @@ def test_functions_that_end_one_rank(what, kind):
 
     def run():
         contacts = [uem.Contact(b.high, ground if what == "distance" else b.low)]
-        # the functions of a surface are asked where there are contactors
+        # the functions of a surface are called where there are contactors
         now.extend([1] * (what != "distance"))
         given = {"bcs": b.oedometer(0.05), "contacts": contacts} | options()
         problem = uem.UnitedProblem(given.pop("F", linear(b.u, 1.0)), b.u, **given)
@@ -144,7 +144,7 @@ def test_one_rank_is_interrupted_before_the_steps(script):
     mpiexec = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
     command = [str(mpiexec), "-n", "2", sys.executable, "-c", script]
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=120)
-    # mpiexec may cut off the end of what a rank that ends all others has told
+    # mpiexec may cut off the end of the message of a rank that ends all others
     assert done.returncode == INTERRUPTED and "Traceback" in done.stderr
 
 

@@ -1,4 +1,4 @@
-"""Wedges in grooves and tips in pits of any opening, and how deep contactors are inside a body: told from its boundary alone."""
+"""Wedges in grooves and tips in pits of any opening, and how deep contactors are inside a body, by its boundary alone."""
 
 from __future__ import annotations
 

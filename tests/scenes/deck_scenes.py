@@ -64,7 +64,7 @@ UNIT = {
 
 
 def two_cells(kind, order):
-    """Places of nodes, and two cells of one kind that have a vertex in common: the unit cell, and the same beside it, along x."""
+    """Places of nodes, and two cells of one kind that have a vertex in common: the unit cell, and the same next to it, along x."""
     first = np.array(UNIT[kind], dtype=float)
     both = np.vstack([first, first + np.eye(first.shape[1])[0]])
     points, number = np.unique(both, axis=0, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Block on block with other fields beside the displacement: pressures, temperatures."""
+"""Block on block with other fields in addition to the displacement: pressures, temperatures."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Fields:
 
 
 def fields(b: Blocks, degree: int, *others: Any, displacement: int = 0) -> Fields:
-    """Blocks with other fields of these elements beside a displacement of some degree."""
+    """Blocks with other fields of these elements and a displacement of some degree."""
     parts = list(others)
     parts.insert(displacement, ("Lagrange", degree, (b.gdim,)))
     return Fields(b, fem.Function(uem.function_space(b.scene.mesh, parts)), displacement)

@@ -220,7 +220,7 @@ def keel(
 
 
 def on_plane(plane: Any, coupling: str, *, mu: float = 0.3, depth: float = 0.4, height: float = 0.4) -> Driven:
-    """A block that stands beside the origin on a rigid plane; its top is driven."""
+    """A block that stands at a distance from the origin on a rigid plane; its top is driven."""
     s = create_scene(MPI.COMM_WORLD, "hexahedron", [box("hexahedron", [0.8, -0.2, 0.0], [1.2, depth - 0.2, height], [3, 3, 3])])
     V = compat.function_space(s.mesh, 1, (3,))
     u, driver = fem.Function(V), fem.Function(V)

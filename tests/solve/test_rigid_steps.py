@@ -41,7 +41,7 @@ def test_conditions_of_the_minimum(seed, k, m, length):
 
 
 def test_rows_that_bear_nothing_go(monkeypatch):
-    """However many rows are broken on the way, the point is asked of no more than those that bear, one more, and some that come back."""
+    """However many rows are broken on the way, the point is computed of no more than those that bear, one more, and some that come back."""
     rng, sizes = np.random.default_rng(3), []
     monkeypatch.setattr(rigid_steps, "nearest_point", lambda p, G, h: sizes.append(len(h)) or nearest_point(p, G, h))
     k, m = 6, 300
