@@ -92,6 +92,22 @@ def function(value: Any) -> TypeGuard[Callable[..., Any]]:
     return callable(value) and not symbolic(value)
 
 
+def fault(values: Array, shape: tuple[int, ...], within: Range, places: Array | None = None) -> str:
+    """What is wrong with values that a function returned, of which not all are as expected: their shape, or the first one.
+
+    Args:
+        values: of a user's function.
+        shape: wanted.
+        within: range of each of them.
+        places: of these values ``(gdim, n)``, if known.
+    """
+    if values.shape != shape:
+        return f"has shape {values.shape}"
+    first = int(np.flatnonzero(~within.holds(values))[0])
+    at = "somewhere" if places is None else f"at ({', '.join(f'{x:.4g}' for x in places[:, first])})"
+    return f"is {values[first]:.6g} {at}"
+
+
 def number(what: str, value: Any, within: Range = FINITE) -> float:
     """A number of a range.
 

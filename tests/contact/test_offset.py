@@ -217,6 +217,8 @@ def test_named_errors():
     F = linear(b.u, modulus(b.scene, 1.0, 1.0))
     short = uem.Contact(b.high, b.low, offset=lambda x: np.zeros(3 * x.shape[1]))
     raised(uem.InputError, r"offset\(x\) has shape", lambda: uem.UnitedProblem(F, b.u, contacts=[short]))
+    half = uem.Contact(b.high, b.low, friction=lambda x: np.where(x[0] < 0.5, -0.25, 0.25))
+    raised(uem.InputError, r"friction\(x\) is -0.25 at \(0, [-.0-9e]+\)", lambda: uem.UnitedProblem(F, b.u, contacts=[half]))
     deep = uem.Contact(b.high, b.low, offset=0.5)
     raised(uem.PenetrationError, "starts 0.5 inside", lambda: uem.UnitedProblem(F, b.u, contacts=[deep]))
     contact = uem.Contact(b.high, b.low)

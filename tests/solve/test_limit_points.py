@@ -7,7 +7,7 @@ from mpi4py import MPI
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import blocks, clamp, raised
+from helpers import at, blocks, clamp, raised, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx.errors import ConvergenceError, FrictionError
@@ -54,3 +54,17 @@ def test_an_answer_takes_the_place_of_advice(kind):
     error = kind("no convergence in 50 iterations: gap 0, 3 active contactors; take smaller load steps, or raise max_iterations")
     error.amend("lead the bodies", instead=True)
     assert str(error) == "no convergence in 50 iterations: gap 0, 3 active contactors; lead the bodies"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("guided", [False, True])
+def test_what_may_slide_almost_freely(guided):
+    """A block that its contact alone holds: where that does not converge, the error says what may hold it, but not of a guided one."""
+    b = blocks(COMM, "quadrilateral", 3, 2, degree=1)
+    force = fem.Constant(b.V.mesh, 0.0)
+    F = st_venant(b.u, 1.0) + force * ufl.TestFunction(b.V)[1] * uem.ds(b.top, b.V.mesh)
+    bcs = [*clamp(b.V, b.bottom), *(clamp(b.V, b.scene.tag("side", 1, at(0, 0.0)), 0) if guided else [])]
+    contact = uem.Contact(b.high, b.low, normal=uem.SoftContact(20.0))
+    problem = uem.UnitedProblem(F, b.u, bcs=bcs, contacts=[contact], load={force: 0.05}, max_iterations=1)
+    error = raised(uem.ConvergenceError, "no convergence in 1 iterations", lambda: list(uem.load_steps(problem)))
+    assert ("may slide or roll there almost freely: hold it" in str(error)) == (not guided)

@@ -120,8 +120,7 @@ class Conductance(given.Sealed):
         with agreed(comm):
             if (h.ndim and h.shape != (n,)) or not given.NOT_NEGATIVE.holds(h).all():
                 words = "h(p, g, T, T_target)" if len(state) == 4 else "h(p, g)"
-                wrong = h[~given.NOT_NEGATIVE.holds(h)] if h.shape in ((), (n,)) else []
-                found = f"is {wrong[0]:.6g} somewhere" if len(wrong) else f"has shape {h.shape}"
+                found = given.fault(h if h.ndim else np.full(n, h), (n,), given.NOT_NEGATIVE)
                 raise InputError(f"contact '{name}': heat, {words} {found}: expected {n} numbers, {given.NOT_NEGATIVE.words}")
         return np.broadcast_to(h, (n,))
 

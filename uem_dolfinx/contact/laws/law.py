@@ -306,5 +306,6 @@ def asked_at(
     with agreed(config.comm):
         if value.shape != (n,) or not within.holds(value).all():
             called = f"{words}({', '.join(['x', *('T' if np.ndim(one) else f'{one:.6g}' for one in more)])})"
-            raise InputError(f"{called} has shape {value.shape}: expected {n} numbers, {within.words.replace('a ', '')}")
+            wrong = given.fault(value, (n,), within, places[: config.gdim])
+            raise InputError(f"{called} {wrong}: expected {n} numbers, each {within.words}")
     return value

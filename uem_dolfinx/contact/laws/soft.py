@@ -111,12 +111,13 @@ class SoftContact(given.Sealed):
         words = f"contact '{name}': normal, p"
 
         def checked(what: str, values: Any, sign: float) -> Array:
-            found = np.asarray(values, dtype=float)
+            found, within = np.asarray(values, dtype=float), given.Range("", lambda x: given.NOT_NEGATIVE.holds(sign * x))
             with agreed(comm):
-                if found.shape != gap.shape or not given.NOT_NEGATIVE.holds(sign * found).all():
+                if found.shape != gap.shape or not within.holds(found).all():
+                    fault = given.fault(found, gap.shape, within)
                     raise InputError(
-                        f"contact '{name}': normal, {what}(g) has shape {found.shape}: expected {len(gap)} finite numbers, pressures that "
-                        "are not negative and do not increase with the gap"
+                        f"contact '{name}': normal, {what}(g) {fault}: expected {len(gap)} finite numbers, pressures that are not "
+                        "negative and do not increase with the gap"
                     )
             return found
 

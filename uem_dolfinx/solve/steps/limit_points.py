@@ -38,6 +38,7 @@ class LimitPoint:
         solver = problem.solver
         #: Whether the constrained matrix of the last attempt had a negative eigenvalue; False if unknown.
         self.indefinite = bool(solver.indefinite or solver.negative)
+        self._loose = self._may_slide()
 
     def name(self, error: UEMError, reached: float, unstable: float | None) -> None:
         """Add to an error that there may be no equilibrium beyond; the committed state must be restored (collective).
@@ -64,6 +65,21 @@ class LimitPoint:
                 f"{': ' if self.indefinite else ', '}{WAYS_ON}",
                 instead=known,
             )
+        if self._loose and not known and isinstance(error, ConvergenceError):
+            error.amend(
+                "contact without friction is all that holds a body, which may slide or roll there almost freely: hold it by a Dirichlet "
+                "condition or by friction, or let it come to rest with a decaying drag"
+            )
+
+    def _may_slide(self) -> bool:
+        """Whether conditions leave a body several motions that only contact without friction resists (collective)."""
+        floating = getattr(self._problem.system, "floating", None)
+        if floating is None or floating.motions is None or any(pair.frictional for pair in self._problem.pairs):
+            return False
+        # each column is of one body
+        motions = floating.motions.open_motions(None).tocsc()
+        body = motions.indices[motions.indptr[:-1]] // floating.motions.n_modes
+        return len(np.unique(body)) < len(body)
 
     def _is_led(self) -> bool:
         """Whether Dirichlet values or rigid surfaces move with the load factor (displacement control)."""
