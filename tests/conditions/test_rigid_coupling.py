@@ -125,6 +125,23 @@ def test_a_load_that_turns_freely():
     assert any(1e-9 < a < 1e-2 and after <= 10.0 * a**2 + 1e-12 for a, after in zip(r, r[1:]))
 
 
+def test_turns_of_an_attempt_come_back():
+    """A body that was led around by more than half a turn, and back to where the step began, has not turned at all."""
+    b = Bar()
+    turn = fem.Constant(b.scene.mesh, 0.0)
+    whole = b.scene.tag("all", 0, lambda x: x[:, 0] >= 0.0)
+    coupling = uem.RigidCoupling(whole, (1.0, 0.5), motion=(0.1, 0.0, turn))
+    problem = b.problem(coupling, bcs=(), law=st_venant)
+    problem.solve()
+    before = problem.linear.memory()
+    turn.value = 1.4 * np.pi
+    problem.attempt()
+    assert coupling.rotation == pytest.approx(1.4 * np.pi, rel=1e-13)
+    problem.restore()
+    assert abs(coupling.rotation) <= 1e-13
+    assert np.array_equal(problem.linear.multipliers, before[0])
+
+
 def test_several_turns_are_counted():
     """A body that is led around three times is where it was, and knows how far it has turned."""
     b = Bar()

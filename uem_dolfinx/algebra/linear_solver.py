@@ -111,8 +111,8 @@ class UnitedSolver:
     def begin_step(self) -> None:
         """Let sparsity and method of solution depend on this step only, but for preconditioners made of a constant K."""
         self._begins, self._of = True, None
-        if not self.lasting:
-            self._kept.drop()
+        for made in () if self.lasting else (self._kept, self.condensed):
+            made.drop()
         for part in (self.condensed, self._united, self._unsymmetric):
             part.begin_step()
 

@@ -59,6 +59,7 @@ class UserRows:
         self.turning: bool = any(one.set.large for one in self.each)
         self.equations = self._joined()
         self.multipliers: Array = np.zeros(len(self.equations))
+        self._committed: tuple[Array, list[Any]] = self.multipliers, self.turns
 
     def _joined(self) -> UnitingEquations:
         return UnitingEquations.join([one.equations for one in self.parts], self._config.gdim)
@@ -72,6 +73,25 @@ class UserRows:
     def turns(self, kept: list[Any]) -> None:
         for one in self.each:
             one.turns, kept = kept[: one.n_turns], kept[one.n_turns :]
+
+    def commit(self, dynamics: Any = None) -> None:
+        """Make the present multipliers and rotations, with rates of the dynamics, those of the committed state (collective)."""
+        if dynamics is not None:
+            self.settle(dynamics)
+        self._committed = self.multipliers, self.turns
+
+    def restore(self) -> None:
+        """Go back to the committed multipliers and rotations: the next tangent and full turns begin with them."""
+        self.multipliers, self.turns = self._committed
+
+    def memory(self) -> tuple[Array, list[Any]]:
+        """Multipliers and rotations of the committed state."""
+        return self._committed
+
+    def remember(self, memory: tuple[Array, list[Any]]) -> None:
+        """Restore them from ``memory``."""
+        self._committed = memory
+        self.restore()
 
     @property
     def rigid(self) -> UserRows | None:

@@ -105,3 +105,4 @@ def take_multipliers(problem: Any) -> None:
     """Set the multipliers of users' equations from a checkpoint, by their eliminated components."""
     eq = problem.linear.equations
     problem.linear.multipliers = np.einsum("mg,mg->m", eq.direction, problem.progress.of_equations[eq.node])
+    problem.linear.commit()

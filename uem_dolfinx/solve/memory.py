@@ -27,6 +27,7 @@ class Memory:
         largest_forces: norm of the largest forces so far.
         motions: of the pairs' rigid targets.
         pairs: state of each pair.
+        of_users: multipliers and rotations of equations of users; None without.
         histories: of the materials, values by name.
         stiffness: diagonal of K ``(n_owned, block)``, which contacts use for directions before K is assembled again; None at first.
         dynamics: state of the dynamics, None in statics.
@@ -36,6 +37,7 @@ class Memory:
     largest_forces: float
     motions: list[Motion | None]
     pairs: list[PairState]
+    of_users: Any
     histories: list[dict[str, Array]]
     stiffness: Array | None
     dynamics: Any
@@ -48,6 +50,7 @@ class Memory:
             largest_forces=problem.largest_forces,
             motions=problem.motions,
             pairs=[pair.committed for pair in problem.interfaces],
+            of_users=None if problem.linear is None else problem.linear.memory(),
             histories=[{name: np.array(f.x.array) for name, f in m.history.items()} for m in problem.materials],
             stiffness=problem.bodies.stiffness_at_start,
             dynamics=None if problem.dynamics is None else problem.dynamics.memory(),
@@ -65,6 +68,8 @@ class Memory:
             problem.dynamics.remember(self.dynamics)
         for pair, own in zip(problem.interfaces, self.pairs):
             pair.remember(own)
+        if problem.linear is not None:
+            problem.linear.remember(self.of_users)
         problem.restore()
 
 

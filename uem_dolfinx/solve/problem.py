@@ -361,13 +361,13 @@ class UnitedProblem(given.Sealed):
         """Solve the united ``system`` of ``bodies``, its own or others in their place, see ``attempt``; the state stays (collective)."""
         if self.linear is not None:
             self.linear.begin_step(self.config.of(start)[: self.config.n_owned], fraction)
-        system.begin_step()
+        method = along or system
+        method.begin_step()
         history = solve_united(
-            bodies, system if along is None else along, rtol=self.rtol, max_iterations=self.max_iterations,
-            line_search=self.line_search and along is None, verbose=self.verbose, forces_before=self.largest_forces,
-            check_signals=lambda: self.progress.check_signals(self.comm),
+            bodies, method, rtol=self.rtol, max_iterations=self.max_iterations, line_search=self.line_search and along is None,
+            verbose=self.verbose, forces_before=self.largest_forces, check_signals=lambda: self.progress.check_signals(self.comm),
         )  # fmt: skip
-        system.end_step()
+        method.end_step()
         if on := {id(contact.pair.whole) for contact in self.contacts if contact.on}:
             from uem_dolfinx.solve.passages import refuse_passages
 
@@ -393,8 +393,8 @@ class UnitedProblem(given.Sealed):
         self.bodies.commit()
         if self.dynamics is not None:
             self.dynamics.commit()
-            if self.linear is not None:
-                self.linear.settle(self.dynamics)
+        if self.linear is not None:
+            self.linear.commit(self.dynamics)
         before = dict(zip(map(id, pairs), self._before.pairs))
         for pair in pairs:
             pair.commit()
@@ -405,9 +405,9 @@ class UnitedProblem(given.Sealed):
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
         self.u.x.array[:] = self.committed
-        self.bodies.restore()
-        if self.dynamics is not None:
-            self.dynamics.restore()
+        with_states: list[Any] = [self.bodies, self.dynamics, self.linear]
+        for part in filter(None, with_states):
+            part.restore()
         for pair in self.interfaces:
             pair.restore()
             pair.discretisation.begin_step()

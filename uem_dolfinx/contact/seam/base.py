@@ -56,6 +56,8 @@ class OnTarget:
         self._renewing = False
         #: Last projection: positions of contactors and target, the anchor, and the result.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
+        #: The same where the anchor's closest points were found; from there a step after a failed attempt begins again.
+        self._at_feet: tuple[Array, Array, Projection | None, Projection] | None = None
 
     def set(self, **changed: Any) -> None:
         """Set ``free``, ``far``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
@@ -63,7 +65,7 @@ class OnTarget:
             self.free = changed["free"][self.nodes]
             changed["prescribed"] = bool(reduced(self.config.comm, int(not self.free.all())))
         if changed.keys() & {"far", "offset"}:
-            self._projected = None
+            self._projected = self._at_feet = None
         self.setting = self.setting._replace(**changed)
 
     @property
@@ -83,6 +85,10 @@ class OnTarget:
         x, last = self.config.x[self.target.dofs], self._projected
         same = last is not None and last[2] is anchor and np.array_equal(points, last[0]) and np.array_equal(x, last[1])
         if last is None or not reduced(self.config.comm, same, op=MPI.LAND):
+            if (last := self._at_feet) is not None and last[2] is anchor:
+                same = np.array_equal(points, last[0]) and np.array_equal(x, last[1])
+                if reduced(self.config.comm, same, op=MPI.LAND):
+                    return last[3]
             found = self.target.project(points) if anchor is None else self.target.follow(points, anchor)
             if anchor is None and self.offset is not None and isinstance(found, FacetProjection):
                 found = self.across(found, points)
@@ -108,7 +114,7 @@ class OnTarget:
         """Projection onto the nearest points of the target, which are kept from now on (collective)."""
         self.anchor = found = self._turning(self.target.project(points), points)
         raised = self.raised(found)
-        self._projected = points, self.config.x[self.target.dofs], found, raised
+        self._projected = self._at_feet = points, self.config.x[self.target.dofs], found, raised
         return raised
 
     def raised(self, projection: Any, which: Ints | None = None) -> Any:

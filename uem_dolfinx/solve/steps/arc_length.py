@@ -65,13 +65,12 @@ class ArcLength:
         self._start, self._from = self._bodies.displacement(), 0.0
         #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
         self._change, self._slope = 0.0, problem.config.unknowns.vector()
-        self.begin_step, self.end_step = self._system.begin_step, self._system.end_step
-        self.accelerate, self.forget = self._system.accelerate, self._system.forget
+        self.end_step, self.accelerate, self.forget = self._system.end_step, self._system.accelerate, self._system.forget
         self.complete, self.reduced_residual = self._system.complete, self._system.reduced_residual
         self.return_to_targets = self._system.return_to_targets
 
     def begin(self, factor: float, direction: Array, length: float, energy: float = np.inf) -> None:
-        """Begin a step.
+        """Set the constraint of the next step.
 
         Args:
             factor: committed load factor.
@@ -81,8 +80,12 @@ class ArcLength:
         """
         self._direction, self._energy = direction / length, energy
         self._start, self._from = self._bodies.displacement(), factor
+
+    def begin_step(self) -> None:
+        """Begin at the committed load factor, whatever factor a failed attempt has come to (collective)."""
         self._change = 0.0
-        self._set(factor)
+        self._set(self._from)
+        self._system.begin_step()
 
     def _set(self, factor: float) -> None:
         self.factor = factor
