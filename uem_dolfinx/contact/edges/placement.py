@@ -151,10 +151,6 @@ class EdgeKinematics(PlacedOnTarget):
         """Multipliers are forces times the contactors' weights."""
         return PressureMap(1.0 / self.share)
 
-    def heights(self) -> Array:
-        """Distances along the normals."""
-        return self.projection.height
-
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """Values at the crossing on both edges; at the node itself without a crossing."""
         own, theirs = self.gaps.weights

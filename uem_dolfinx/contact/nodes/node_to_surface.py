@@ -312,10 +312,6 @@ class NodalKinematics(PlacedOnTarget):
         """Map of nodal forces, which are integrals of the pressure times the node's shape function."""
         return PressureMap(self.cone)
 
-    def heights(self) -> Array:
-        """Heights of the nodes."""
-        return self.projection.height
-
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """Values at the nodes, and at their closest points."""
         n = len(self.points)

@@ -193,6 +193,10 @@ class PlacedOnTarget:
         """Open ends, which hold no contactors here."""
         return Ends(self.projection, self.of.thickness)
 
+    def heights(self) -> Array:
+        """Those of the projection."""
+        return self.projection.height
+
     def forces(self: Kinematics, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
         """Forces of the rows at both bodies, where contactors follow each other too (collective)."""
         of, mu = self.gap_rows, np.zeros(len(self.gap))
