@@ -80,12 +80,12 @@ writer = uem.ResultsWriter(f"{args.output}/tube", problem, fields=fields) if arg
 
 
 def steps():
-    """Every 50th step, after its figures."""
+    """Every 50th step; the book adds up the work of every step, as the force of the press is rough."""
     for step in uem.time_steps(problem, end=args.stroke / speed):
         rows.append((step.time * speed, contact.between("press").force[1]))
+        book.write(step)
         if step.number % 50 == 0:
             metal.cell_averages()
-            book.write(step)
             if writer is not None:
                 writer.write(step)
             yield step
@@ -134,5 +134,4 @@ if args.plot:
 
 # %%
 if args.stroke >= 30.0:
-    # at the start the press stops the mass of the upper surface, which takes some energy
-    assert abs(results["force_error"]) < 0.15 and results["energy_error"] < 0.1, results
+    assert abs(results["force_error"]) < 0.15 and results["energy_error"] < 0.01, results

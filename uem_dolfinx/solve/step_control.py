@@ -42,11 +42,14 @@ class StepControl:
         due: number of the step after which explicit steps look at how fast edges of cells are stretched.
         stretch: of these until then, since the critical step was found.
         resolved: bound on the length of explicit steps that resolve contacts on a stiff surface.
+        of_contact: whether contacts change the critical step of explicit steps.
+        shortest: edge of a cell when explicit steps last looked at them, a length.
     """
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
         self._cuts, self._read, self._longest_before, self.due, self.stretch, self.resolved = 0, False, np.inf, 0, 0.0, np.inf
+        self.of_contact, self.shortest = False, np.inf
 
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
@@ -135,13 +138,19 @@ class StepControl:
             "critical step due": self.due,
             "stretch of cells": self.stretch,
             "resolved step": self.resolved,
+            "steps of contact": self.of_contact,
+            "shortest edge": self.shortest,
         }
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
         # files of earlier versions lack these
-        kept = {"largest speed": 0.0, "critical step due": 0, "stretch of cells": np.inf, "resolved step": np.inf} | kept
+        kept = {
+            "largest speed": 0.0, "critical step due": 0, "stretch of cells": np.inf, "resolved step": np.inf, "shortest edge": np.inf,
+        } | kept  # fmt: skip
+        kept.setdefault("steps of contact", False)
         (
-            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due, self.stretch, self.resolved
+            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due, self.stretch, self.resolved,
+            self.of_contact, self.shortest,
         ) = (kept[name] for name in self.to_checkpoint())  # fmt: skip
         self._read, self._longest_before = True, self.longest

@@ -73,15 +73,13 @@ class ExplicitStepper:
         self.limit = np.inf
         #: Part of the critical step that resolves closed contacts.
         self.part = 1.0
-        #: Whether contacts change the critical step.
-        self.of_contact = False
         config = problem.config
         n_vertices, dofs = len(forms.reference_topology(compat.cell_name(config.mesh))[0]), compat.cell_dofs(config.V)
         pairs = np.sort(dofs[:, np.array(np.triu_indices(n_vertices, 1))].transpose(0, 2, 1).reshape(-1, 2), axis=1)
         #: Pairs of vertices of a cell ``(2, n)``, and, as last looked at, their shortest distance, the fastest rate of stretching and the
         #: mean velocity of nodes.
         self._edges = np.array(np.divmod(np.unique(pairs @ [len(config.x), 1]), len(config.x)))
-        self._shortest, self.rate, self._mean = np.inf, 0.0, np.zeros(config.gdim)
+        self.shortest, self.rate, self._mean = np.inf, 0.0, np.zeros(config.gdim)
         self._of_mesh = self._lengths(config.X)
         self._least = COLLAPSED * reduced(problem.comm, float(self._of_mesh.min(initial=np.inf)), op=MPI.MIN)
         #: How far nodes may have moved against each other since cells were checked for inversion, and whether accelerations may have
@@ -139,7 +137,7 @@ class ExplicitStepper:
 
     def pattern(self) -> tuple[int, ...]:
         """Fingerprint of the active contactors, if they change the critical step (collective)."""
-        if not self.of_contact:
+        if not self.problem.step_control.of_contact:
             return ()
         own = zlib.crc32(b"".join(pair.united.tobytes() for pair in self.problem.interfaces))
         return tuple(gathered(self.problem.comm, np.array(own)))
@@ -181,7 +179,7 @@ class ExplicitStepper:
             way = config.of(problem.u.x.array - problem.committed)[: config.n_owned] - dt * self._mean
             sizes = np.array([np.abs(a).max(initial=0.0), np.abs(way).max(initial=0.0)])
             largest, moved = reduced(problem.comm, sizes, op=MPI.MAX)
-            least = CHECKED_STRAIN * self._shortest
+            least = CHECKED_STRAIN * self.shortest
             self.sudden = not bodies.linear and 2.0 * largest * dt**2 > least
             self._moved += 2.0 * np.sqrt(config.gdim) * moved
             if self.sudden:
@@ -221,7 +219,7 @@ class ExplicitStepper:
         The surface follows the masses in equilibrium: its stiffness alone does not count. If a surface at rest would hardly make the
         frequency higher, that bound is taken, which no contact exceeds; otherwise ``of_contact`` is set, as contacts change the step.
         """
-        problem = self.problem
+        problem, control = self.problem, self.problem.step_control
         problem.bodies.update_tangent()
         fixed = self._highest(self._stiffness_if_fixed)
         with problem.bodies.holding(self.interior):
@@ -232,8 +230,8 @@ class ExplicitStepper:
             condensed = self._highest(self._stiffness)
         stiff = fixed > STIFF_SURFACE * condensed
         # closed contacts leave nothing of the surface that could be at rest
-        closed = self.of_contact and reduced(problem.comm, int(any(pair.united.any() for pair in problem.interfaces))) > 0
-        self.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
+        closed = control.of_contact and reduced(problem.comm, int(any(pair.united.any() for pair in problem.interfaces))) > 0
+        control.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
         return condensed if stiff else fixed
 
     def _lengths(self, of: Array) -> Array:
@@ -257,11 +255,11 @@ class ExplicitStepper:
         length = self._lengths(config.x)
         found = self._lengths(v) / length, 1.0 / length, np.abs(length / self._of_mesh - 1.0)
         self.rate, inverse, strain = reduced(self.problem.comm, np.array([of.max(initial=0.0) for of in found]), op=MPI.MAX)
-        self._shortest = 1.0 / inverse
+        self.shortest = 1.0 / inverse
         self._mean = reduced(self.problem.comm, v[: config.n_owned].sum(axis=0)) / config.index_map.size_global
-        if self._shortest < self._least:
+        if self.shortest < self._least:
             raise InvertedElementError(
-                f"cells collapse: their shortest edge, {self._least / COLLAPSED:.3g} at the start, is {self._shortest:.3g}; "
+                f"cells collapse: their shortest edge, {self._least / COLLAPSED:.3g} at the start, is {self.shortest:.3g}; "
                 "take a finer mesh, or lower speeds"
             )
         return float(strain) if strain < CHECKED_STRAIN else stretch

@@ -55,7 +55,9 @@ class Prediction:
         """Move nodes with mass to ``start (n,)``, ghosts included, and the surface from there into equilibrium with the last contact."""
         problem, bodies, system = self.problem, self.problem.bodies, self.system
         if system.rows is None:
-            return
+            # the first step of a run that goes on
+            bodies.update_tangent()
+            system.rows = system.present_rows()
         if not self.kept:
             self._prepare()
         u = np.array(start)

@@ -10,6 +10,7 @@ A node that touches takes the normal velocity of its target, as in a plastic imp
 
 from __future__ import annotations
 
+from copy import copy
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +24,6 @@ from uem_dolfinx.dynamics.explicit.mass_solver import MassSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
 from uem_dolfinx.errors import MassError, UEMError
 from uem_dolfinx.solve.bodies.bodies import Bodies
-from uem_dolfinx.solve.united.system import BodySystem
 
 
 class InertBodies(Bodies):
@@ -95,8 +95,12 @@ class StepperWithMass(ExplicitStepper):
         """Make ``system``, whose solution is not predicted (collective)."""
         problem = self.problem
         self.bodies = InertBodies(problem.bodies, self._mass)
-        solver = MassSolver(problem.config.unknowns, "uem_masses_")
-        return BodySystem(self.bodies, problem.interfaces, solver, consistent_tangent=False, linear=problem.linear), None
+        # the contacts stay in their state, which may be that of a checkpoint
+        system = copy(problem.system)
+        system.bodies, system.solver = self.bodies, MassSolver(problem.config.unknowns, "uem_masses_")
+        system.consistent_tangent = False
+        system.take(problem.interfaces, problem.linear)
+        return system, None
 
     def forget(self) -> None:
         """A step depends on its beginning alone."""

@@ -42,9 +42,11 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), stepper.pattern()
     control.begin(length)
     stepper.look()
-    if not resumed:
+    if resumed:
+        stepper.shortest = control.shortest
+    else:
         # bodies that touch deform from the first step on
-        control.due, control.stretch = control.number + 1, 0.0
+        control.due, control.stretch, control.shortest = control.number + 1, 0.0, stepper.shortest
     while (remainder := end - dynamics.time) > LEFT * length:
         taken = min(length if remainder >= (1.0 - LEFT) * length else remainder, control.longest)
         try:
@@ -63,19 +65,20 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
             raise
         number, cuts = control.done(iterations)
         after = touching(problem)
-        last = pattern
-        yield TimeStep(number, dynamics.time, taken, iterations, cuts, *events(problem, before, after))
+        done, last = TimeStep(number, dynamics.time, taken, iterations, cuts, *events(problem, before, after)), pattern
         # bodies that meet deform from now on
         due = not problem.bodies.linear and (number >= control.due or after != before or stepper.sudden)
         before, found = after, (pattern := stepper.pattern()) != last
         if due or found:
-            control.stretch = stepper.look(control.stretch)
+            control.stretch, control.shortest = stepper.look(control.stretch), stepper.shortest
         if found or (due and not stepper.steps_to_look(length, control.stretch)):
             length, control.stretch = _length(stepper, dt, end), 0.0
             control.begin(length)
         if due or found:
             steps = max(stepper.steps_to_look(length, control.stretch), 1)
             control.due, control.stretch = number + steps, control.stretch + steps * length * stepper.rate
+        # a checkpoint holds what the next step begins with
+        yield done
 
 
 def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:

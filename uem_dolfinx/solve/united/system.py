@@ -195,7 +195,7 @@ class BodySystem:
             bodies.update_tangent()
         F, rounding = self.residual(), self.rounding()
         with timed("uniting equations"):
-            rows, self._here = self._rows_here(), None
+            rows, self._here = self.present_rows(), None
             residual = rows.test.reduce(y := rows.test.pass_on(F))
             at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             if at_rest or (turning and not pairs):
@@ -244,7 +244,7 @@ class BodySystem:
             held=held,
         )
 
-    def _rows_here(self) -> Rows:
+    def present_rows(self) -> Rows:
         """Equations at the last projection, with its slip directions (collective)."""
         if self._here is None:
             for pair in self.near:
@@ -366,7 +366,7 @@ class BodySystem:
 
         Q uses the present normals and slips: with the old Q, rotated contact forces would count as residual.
         """
-        return self._rows_here().test.transpose(self.residual())
+        return self.present_rows().test.transpose(self.residual())
 
     def accelerate(self) -> None:
         """Find the initial acceleration of the bodies (collective)."""
