@@ -56,11 +56,11 @@ def test_as_if_the_body_with_corners_were_the_contactor(make, how):
     force, contact = force_of(make(corners=True, **how))
     swapped, _ = force_of(make(swap=True, **how))
     assert abs(force - swapped) < (0.04 if make is not tooth else 0.1) * swapped
-    assert contact.at_corners.n_active == 0 < COMM.allreduce(int(contact.at_corners.pair.trial.active.sum()))
+    assert contact.further[0].n_active == 0 < COMM.allreduce(int(contact.further[0].pair.trial.active.sum()))
     balance = contact.balance()
     assert balance.force < 1e-12 and balance.moment < 1e-9
-    deepest = COMM.allreduce(float(np.min(contact.at_corners.pair.projection.gap, initial=np.inf)), op=MPI.MIN)
-    out = contact.at_corners.pair.off
+    deepest = COMM.allreduce(float(np.min(contact.further[0].pair.projection.gap, initial=np.inf)), op=MPI.MIN)
+    out = contact.further[0].pair.off
     assert deepest > -1e-9 * contact.config.size or COMM.allreduce(int(out.sum()))
 
 
@@ -142,7 +142,7 @@ def test_contacts_that_cannot_have_a_second_part(how):
     with pytest.raises(uem.InputError, match="corners = True goes with hard"):
         punch(corners=True, **how)
     (problem, contact, _), _ = punch(**how)
-    assert contact.at_corners is None and problem.contacts == [contact]
+    assert not contact.further and problem.contacts == [contact]
 
 
 def test_round_targets_have_none():
@@ -157,15 +157,15 @@ def test_round_targets_have_none():
     problem, contact, _ = pressed(
         [low, disc.mapped(bend)], ([(0, at(1, 0.0))], [round_]), (1, at(1, 1.0), [0.0, -0.02]), (1.0, 1.0), corners=True
     )
-    assert contact.at_corners is None
-    assert uem.Contact(contact.contactor, uem.RigidPlane((0.0, 1.0), (0.0, -1.0))).at_corners is None
+    assert not contact.further
+    assert uem.Contact(contact.contactor, uem.RigidPlane((0.0, 1.0), (0.0, -1.0))).further == ()
 
 
 @pytest.mark.parametrize("slope, expected", [(0.3, 1), (0.2, 0)])
 def test_which_edges_are_pointed(slope, expected):
     """A ridge whose flanks turn by 33 degrees is, one of 23 degrees is not: a polygon of 12 sides and more is round."""
     (problem, contact, _), (tip,) = wedge(slope=slope, corners=True)
-    X = problem.config.X[contact.at_corners.nodes]
+    X = problem.config.X[contact.further[0].nodes]
     assert COMM.allreduce(int((np.abs(X[:, 0] - tip) < 1e-9).sum())) == expected
 
 
@@ -186,14 +186,14 @@ def test_friction_and_offset_between_steps():
     (problem, contact, _), _ = punch(n=8, friction=0.3, corners=True)
     problem.solve()
     contact.friction, contact.offset = 0.1, 1e-3
-    part = contact.at_corners
+    part = contact.further[0]
     assert part.friction == 0.1 and (part.friction_values() == 0.1).all() and part.offset == 1e-3
     before = abs(contact.resultant().force[1])
     problem.solve()
     assert abs(contact.resultant().force[1]) > 1.02 * before
     (problem, contact, _), _ = punch(n=8, corners=True)
     list(uem.load_steps(problem, [uem.Step("press", 1), uem.Step("release", 1, contacts={contact: False})]))
-    assert contact.n_active == 0 and not contact.on and not contact.at_corners.on
+    assert contact.n_active == 0 and not contact.on and not contact.further[0].on
     assert abs(contact.resultant().force).max() == 0.0
 
 
@@ -215,4 +215,4 @@ def test_target_is_of_one_body_with_its_facets():
     """The corners are found on the outside of the body where the target ends at them."""
     (problem, contact, _), _ = punch(closed=False, corners=True)
     facets = facets_of(problem.config, contact.target)
-    assert COMM.allreduce(int(pointed.pointed_sides(facets).sum())) == 2 == COMM.allreduce(len(contact.at_corners.nodes))
+    assert COMM.allreduce(int(pointed.pointed_sides(facets).sum())) == 2 == COMM.allreduce(len(contact.further[0].nodes))

@@ -11,7 +11,9 @@ from mpi4py import MPI
 import numpy as np
 from benchmarks.scenes import Array, Body, Scene, box, scene
 from block_scenes import linear
+from body_scenes import without
 from dolfinx import fem
+from dolfinx.mesh import exterior_facet_indices
 
 import uem_dolfinx as uem
 
@@ -48,31 +50,35 @@ class Crossed:
     Attributes:
         scene: the bodies.
         u: displacement.
-        contact: of both.
+        contact: of both, the upper one's surface on the lower one's if it is declared by hand.
         problem: with all.
         R: turns the drawing into the scene ``(3, 3)``.
     """
 
     scene: Scene
     u: fem.Function
-    contact: uem.GeneralContact
+    contact: Any
     problem: uem.UnitedProblem
     R: Array
 
     @property
     def force(self) -> Array:
         """On the lower body, in the drawing ``(3,)`` (collective)."""
-        return self.contact.between("body 1").force @ self.R
+        if isinstance(self.contact, uem.GeneralContact):
+            return self.contact.between("body 1").force @ self.R
+        return self.contact.resultant(on="contactor" if self.contact.contactor.name == "side 0" else "target").force @ self.R
 
     @property
     def edges(self) -> list[uem.Contact]:
         """The contacts at crossings."""
-        return [part for part in self.contact.parts if "at edges" in part.name]
+        if isinstance(self.contact, uem.GeneralContact):
+            return [part for part in self.contact.parts if "at edges" in part.name]
+        return [part for part in self.contact.further if "edges" in part.name]
 
     @property
     def n_crossings(self) -> int:
         """Active ones (collective)."""
-        return sum(part.n_active for part in self.edges)
+        return COMM.allreduce(sum(int(part.pair.united.sum()) for part in self.edges))
 
 
 def crossed(
@@ -83,9 +89,11 @@ def crossed(
     *,
     degree: int = 1,
     R: Array | None = None,
+    size: float = 1.0,
     law: Callable[..., Any] = linear,
     dynamics: Callable[[Any], Any] | None = None,
     first: int | None = None,
+    surfaces: Sequence[Callable[[Array], Any]] | None = None,
     **contact: Any,
 ) -> Crossed:
     """Two bodies, the upper one moved by ``way (3,)`` of the drawing in the last step (collective).
@@ -97,24 +105,32 @@ def crossed(
         way: displacement of the moved nodes at load factor 1.
         degree: of the displacement.
         R: rotation of the scene ``(3, 3)``.
+        size: of the whole scene over that of the drawing.
         law: see ``linear``.
         dynamics: function of the space that returns inertia, or None.
         first: number of the body whose nodes are contactors, or None.
-        contact: arguments of the general contact.
+        surfaces: functions that find the surfaces of both bodies in the drawing, for a contact that is declared; None: general contact.
+        contact: its arguments.
     """
     R = np.eye(3) if R is None else R
-    s = scene(COMM, cell, bodies, pose=lambda x: x @ R.T)
+    s = scene(COMM, cell, bodies, pose=lambda x: size * x @ R.T)
     V = uem.function_space(s.mesh, degree, (3,))
     u = fem.Function(V)
-    tags = [s.tag(f"held {k}", k, where) for k, where in enumerate(held)]
-    values = np.zeros(3), R @ np.asarray(way, dtype=float)
+    tags = [s.tag(f"held {k}", min(k, len(bodies) - 1), where) for k, where in enumerate(held)]
+    values = np.zeros(3), size * R @ np.asarray(way, dtype=float)
     bcs = [uem.dirichlet(V, tag, value=value.tolist()) for tag, value in zip(tags, values)]
-    if first is not None:
-        contact["order"] = [tags[first]]
-    general = uem.GeneralContact(**({"max_penetration": 1.0} | contact))
+    how = {"max_penetration": size} | contact
+    if surfaces is not None:
+        outer, sides = exterior_facet_indices(s.mesh.topology), []
+        for k, where in enumerate(surfaces):
+            facets = np.intersect1d(s.tag(f"side {k}", k, where).entities, outer).astype(np.int32)
+            sides.append(uem.Tag(f"side {k}", 1, 2, s.mesh, facets))
+        both: Any = uem.Contact(*(sides if first == 0 else sides[::-1]), **how)
+    else:
+        both = uem.GeneralContact(**how | ({} if first is None else {"order": [tags[first]]}))
     more = {} if dynamics is None else {"dynamics": dynamics(V)}
-    problem = uem.UnitedProblem(law(u, E), u, bcs=bcs, contacts=[general], **more)
-    return Crossed(s, u, general, problem, R)
+    problem = uem.UnitedProblem(law(u, E), u, bcs=bcs, contacts=[both], **more)
+    return Crossed(s, u, both, problem, R)
 
 
 def roofs(
@@ -150,3 +166,43 @@ def turned(seed: int) -> Array:
     Q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     Q = Q * np.sign(np.diag(r))
     return Q * np.linalg.det(Q)
+
+
+def folded(
+    shift: float, *, link: bool = True, R: Array | None = None, way: Sequence[float] = (0.0, 0.0, -0.1), **how: Any
+) -> Crossed:
+    """Rods across each other, face on face, 0.02 apart, held at their ends; an arm behind these makes both one body.
+
+    Args:
+        shift: moves the nodes of both rods near the crossing along these.
+        link: whether the arm is whole; without, there are two bodies.
+        R: rotation of the scene ``(3, 3)``.
+        way: of the upper rod's ends.
+        how: arguments of the contact, and of ``crossed``.
+    """
+    L, gap = 3.0, 0.02
+    along, up = np.linspace(-L, L + 1.0, 15), np.array([-1.0, -0.5, 0.0, gap, gap + 0.5, gap + 1.0])
+    whole = box("hexahedron", (0.0, 0.0, 0.0), (14.0, 14.0, 5.0), (14, 14, 5))
+    i, j, k = np.rint(whole.x).astype(int).T
+    whole = Body(np.column_stack([along[i], along[j], up[k]]), whole.cells)
+
+    def hole(x: Array) -> Any:
+        a, b, z = x.T
+        low = (z < 0.0) & ((np.abs(b) < 0.5) | ((a > L) & (b > -0.5)))
+        high = (z > gap) & ((np.abs(a) < 0.5) | ((b > L) & (a > -0.5)))
+        column = (a > L) & (b > L) if link else (a < -L) & (b < -L)
+        return ~(low | high | column) | ((not link) & (a > L - 1.0) & (b > L - 1.0))
+
+    def moved(x: Array) -> Array:
+        near = shift * np.sin(np.pi * np.clip(x[:, :2], -L, L) / L)
+        low = x[:, 2] < 0.5 * gap
+        return x + np.column_stack(
+            [near[:, 0] * (low & (np.abs(x[:, 1]) < 0.6)), near[:, 1] * (~low & (np.abs(x[:, 0]) < 0.6)), 0.0 * x[:, 2]]
+        )
+
+    def ends(x: Array, k: int) -> Any:
+        low = x[:, 2] < 0.5 * gap
+        return (low != bool(k)) & (np.abs(np.abs(x[:, k]) - L) < 1e-9) & (np.abs(x[:, 1 - k]) < 0.6)
+
+    body = without(whole, hole).mapped(moved)
+    return crossed("hexahedron", [body], [lambda x: ends(x, 0), lambda x: ends(x, 1)], way, R=R, max_penetration=0.5, **how)

@@ -157,7 +157,7 @@ def check_goal(problem: UnitedProblem, J: ufl.Form) -> None:
             (any(hasattr(contact, "parts") for contact in problem.declared), "general contact"),
             (
                 any(not _of_facets(problem, contact) for contact in problem.contacts),
-                "contactors that are points, or corners=True",
+                "contactors that are points, or corners=True or edges=True",
             ),
         ):
             if present:
@@ -172,7 +172,7 @@ def _proportional(law: FrictionLaw) -> bool:
 def _of_facets(problem: UnitedProblem, contact: Contact) -> bool:
     """Whether contactors are the nodes of facets."""
     tag = contact.contactor
-    return isinstance(tag, Tag) and tag.dim == problem.config.tdim - 1 and not contact.corners_touch()
+    return isinstance(tag, Tag) and tag.dim == problem.config.tdim - 1 and not contact.further_parts_touch()
 
 
 class _System:

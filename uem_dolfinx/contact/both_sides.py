@@ -1,7 +1,8 @@
-"""Results of a contact with a second part, whose contactors are nodes at corners of the target."""
+"""Results of a contact with further parts, whose contactors are nodes at corners of the target, or edges that cross."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from mpi4py import MPI
@@ -16,32 +17,34 @@ from uem_dolfinx.parallel import reduced
 
 
 class OfBothSides(ContactResults):
-    """Results of a contact and of its second part; those of a second part itself are zero, so that sums over contacts are right."""
+    """Results of a contact and of its further parts; those of a further part itself are zero, so that sums over contacts are right."""
 
-    #: Whether its results are those of another contact, of which it is the second part.
-    is_second_part = False
-    #: The second part: nodes at corners of the target, and the contactor's facets; None without.
-    at_corners: Any = None
+    #: Whether its results are those of another contact, of which it is a further part.
+    is_further_part = False
+    #: Whether the contactors of a further part are nodes of the contact's target.
+    swaps = False
+    #: Further parts: nodes at corners of the target with the contactor's facets, and crossings of edges.
+    further: Sequence[Any] = ()
 
     @property
-    def parts_with_corners(self) -> list[Any]:
-        """The contact, and its second part if there is one."""
-        return [self] if self.at_corners is None else [self, self.at_corners]
+    def all_parts(self) -> list[Any]:
+        """The contact, and its further parts."""
+        return [self, *self.further]
 
-    def corners_touch(self) -> bool:
-        """Whether nodes at corners of the target are active contactors (collective)."""
-        part = self.at_corners
-        return part is not None and bool(reduced(self.config.comm, bool(part.pair.trial.active.any()), op=MPI.LOR))
+    def further_parts_touch(self) -> bool:
+        """Whether further parts have active contactors (collective)."""
+        active = any(part.pair.trial.active.any() for part in self.further)
+        return bool(self.further) and bool(reduced(self.config.comm, active, op=MPI.LOR))
 
     def _sum(self, what: str, together: Any, nothing: Any) -> Any:
-        """A result of both parts (collective)."""
-        if self.is_second_part:
+        """A result of all parts (collective)."""
+        if self.is_further_part:
             return nothing
-        return together([getattr(ContactResults, what).__get__(part) for part in self.parts_with_corners])
+        return together([getattr(ContactResults, what).__get__(part) for part in self.all_parts])
 
     @property
     def n_active(self) -> int:
-        """Number of active contactors over all ranks, those at corners of the target among them (collective)."""
+        """Number of active contactors over all ranks, those of further parts among them (collective)."""
         return int(self._sum("n_active", sum, 0))
 
     @property
@@ -53,14 +56,14 @@ class OfBothSides(ContactResults):
     def force(self) -> fem.Function:
         """Nodal contact forces as a vector field: on the contactors, and opposite on the nodes of a meshed target (collective)."""
         f = super().force
-        if self.is_second_part:
+        if self.is_further_part:
             f.x.array[:] = 0.0
-        elif self.at_corners is not None:
-            f.x.array[:] += self.at_corners.all_forces()
+        for part in self.further:
+            f.x.array[:] += part.all_forces()
         return f
 
     def all_forces(self) -> Array:
-        """Nodal forces of a second part on both bodies ``(n_local gdim,)`` (collective)."""
+        """Nodal forces of a further part on both bodies ``(n_local gdim,)`` (collective)."""
         return np.array(super().force.x.array)
 
     def force_on(self, side: Literal["contactor", "target"]) -> fem.Function:
@@ -70,31 +73,32 @@ class OfBothSides(ContactResults):
             side: ``"contactor"`` or ``"target"``; the sum of both fields is :attr:`force`.
         """
         f = super().force_on(side)
-        if self.at_corners is not None:
-            back = self.at_corners.all_forces() - super(OfBothSides, self.at_corners).force_on("contactor").x.array
-            f.x.array[:] += back if side == "contactor" else -back
+        if self.further:
+            more = sum(part.all_forces() for part in self.further).reshape(-1, self.config.gdim)
+            here = np.isin(np.arange(self.config.n_owned), self.nodes, invert=side == "target")
+            f.x.array.reshape(more.shape)[: len(here)][here] += more[: len(here)][here]
+            f.x.scatter_forward()
         return f
 
     def resultant(self, about: npt.ArrayLike | None = None, *, on: Literal["contactor", "target"] = "contactor") -> Resultant:
         """Force and moment that the contact exerts on one of the bodies; see ``ContactResults.resultant`` (collective)."""
         found = super().resultant(about, on=on)
-        if self.is_second_part:
+        if self.is_further_part:
             return Resultant(0.0 * found.force, 0.0 * found.moment)
-        if self.at_corners is None:
-            return found
         other: Literal["contactor", "target"] = "target" if on == "contactor" else "contactor"
         centre = np.zeros(self.config.gdim) if about is None else about
-        more = super(OfBothSides, self.at_corners).resultant(centre, on=other)
-        return Resultant(found.force + more.force, found.moment + more.moment, found.normal + more.normal)
+        for part in self.further:
+            more = super(OfBothSides, part).resultant(centre, on=other if part.swaps else on)
+            found = Resultant(found.force + more.force, found.moment + more.moment, found.normal + more.normal)
+        return found
 
-    def _with_corners(self, across: Array, along: Array) -> tuple[Array, Array]:
-        """Forces on contactors, with those of the target's corners, by the contactors around these (collective)."""
-        if self.at_corners is None:
-            return across, along
-        part, spread = self.at_corners.pair, self.pair.discretisation.spread
-        row, node, weight = part.kinematics.means()[1]
-        normal, tangential = part.pressing()
-        told = np.column_stack([normal, -tangential])[row] * weight[:, None]
-        received = self.config.add_at_owners(node, told)[self.pair.nodes]
-        more = np.column_stack([spread(component) for component in received.T])
-        return across + more[:, 0], along + more[:, 1:]
+    def _with_further(self, across: Array, along: Array) -> tuple[Array, Array]:
+        """Forces on contactors, with those of further parts, by the contactors around their points (collective)."""
+        for part in self.further:
+            row, node, weight = part.pair.kinematics.means()[int(part.swaps)]
+            normal, tangential = part.pair.pressing()
+            told = np.column_stack([normal, -tangential if part.swaps else tangential])[row] * weight[:, None]
+            received = self.config.add_at_owners(node, told)[self.pair.nodes]
+            more = np.column_stack([self.pair.discretisation.spread(component) for component in received.T])
+            across, along = across + more[:, 0], along + more[:, 1:]
+        return across, along

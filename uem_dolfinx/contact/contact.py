@@ -81,12 +81,10 @@ class Contact(WatchedContact, given.Sealed):
             second argument also of the load factor or time at the end of the step. Or a scalar Function of the displacement's
             nodes, which every step reads, or an ``OfTemperature``. Or a law with any of these as parameter: ``Coulomb`` with a
             limit, ``Tresca``, ``Thirion``, ``Stribeck``. With 0 it is frictionless. If the contact was made with friction, it may be
-            changed between steps, by the same law. Other settings, except ``offset``, cannot be changed once a problem has been
-            made.
+            changed between steps, by the same law; of other settings only ``offset`` may, once a problem has been made.
         wear: Archard's coefficient over the hardness, one over a pressure, a number or a function of position as for ``friction``.
             After every step the worn volume of the contactor is ``wear N s`` for the force N that slips by s, with friction or
-            without, and gaps are larger by the worn depth. Results are :attr:`wear` and :attr:`worn_volume`. The target does not
-            wear.
+            without, and gaps are larger by the worn depth: see :attr:`wear` and :attr:`worn_volume`. The target does not wear.
         heat: a ``Conductance``: heat conduction through the contact, if one of the other fields of a mixed space is a temperature.
             Or a list, for instance of heat and electric current; each of them gets the whole pressure.
         measure: area of pressures and tractions: ``"reference"``, of the undeformed surface, the only one in small strains, or
@@ -108,6 +106,8 @@ class Contact(WatchedContact, given.Sealed):
         leak: a ``Leak`` lets a fluid enter between the surfaces from one side, which presses on both.
         corners: True makes nodes at pointed convex edges of a meshed target contactors of the contactor's facets, too, with
             ``"node_to_surface"`` and hard contact without wear, ``adjust`` and heat. False: they may enter between contactors.
+        edges: True holds sharp convex edges of both bodies apart where they cross in 3D, by one equation at each crossing; with what
+            ``corners`` goes with, and ``"finite"`` sliding.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.
@@ -144,6 +144,7 @@ class Contact(WatchedContact, given.Sealed):
         cohesion: Cohesive | Adhesion | None = None,
         leak: Leak | None = None,
         corners: bool = False,
+        edges: bool = False,
         measure: Literal["reference", "current"] = "reference",
         name: str | None = None,
     ):
@@ -157,7 +158,8 @@ class Contact(WatchedContact, given.Sealed):
             normals = given.word("normals", normals, ("facet", "averaged"))
             max_penetration = None if max_penetration is None else given.number("max_penetration", max_penetration, BOUND)
             thickness = None if thickness is None else given.number("thickness", thickness, THICKNESS)
-            self.corners, chords = given.flag("corners", corners), given.flag("chords", chords)
+            self.corners, self.edges = given.flag("corners", corners), given.flag("edges", edges)
+            chords = given.flag("chords", chords)
             self._friction, self._wear = given_friction(friction), given_field("wear", wear, given.NOT_NEGATIVE)
             self.heats = conductances_of(heat)
             self.normal = given_normal(normal, friction, wear, self.heats, tied)
@@ -232,8 +234,8 @@ class Contact(WatchedContact, given.Sealed):
         """Set a friction law with these values at the contactors ``(n,)``, None for zeros (collective)."""
         if self.pair.frictional:
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
-        if self.at_corners is not None:
-            self.at_corners._take_friction(law, self._friction_at(law, self.at_corners.nodes, self._at))
+        for part in self.further:
+            part._take_friction(law, self._friction_at(law, part.nodes, self._at))
 
     def take_load(self, at: float, known: bool = False) -> None:
         """Update friction to a load factor or a time, if it depends on these, and values of Functions (collective).
@@ -299,9 +301,9 @@ class Contact(WatchedContact, given.Sealed):
         """Set the present offset in the pair, if an offset is or was in use (collective)."""
         if self._offsets is not None or callable(self._offset) or self._offset != 0.0:
             self._offsets_of_pair().set(self._offset)
-        if self.at_corners is not None:
-            self.at_corners._set_offset()
-            self.at_corners.pair.project()
+        for part in self.further:
+            part._set_offset()
+            part.pair.project()
 
     def _offsets_of_pair(self) -> Offsets:
         """Offsets of the pair's gaps, made at the first call."""
@@ -344,8 +346,8 @@ class Contact(WatchedContact, given.Sealed):
             max_penetration=self.max_penetration, chords=self.chords, target=type(self.target).__name__,
             coupling=self.coupling if isinstance(self.coupling, str) else type(self.coupling).__name__,
             friction=parameters(as_law(self.friction)), measure=self.measure, tied=self.tied, adjust=self.adjust, offset=self.offset,
-            wear=self._wear, corners=self.corners, normal=repr(self.normal), cohesion=repr(self.cohesion), leak=repr(self.leak),
-            heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
+            wear=self._wear, corners=self.corners, edges=self.edges, normal=repr(self.normal), cohesion=repr(self.cohesion),
+            leak=repr(self.leak), heat=[given.described(p) for one in self.heats for p in one.parameters.values()],
         )  # fmt: skip
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)

@@ -3,30 +3,75 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
+from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
+from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.further.part import FurtherPart
+
+_orders = count(start=1)
 
 
 def attached(contacts: Sequence[Contact], config: Configuration, free: Bools, clock: dict[str, Any]) -> list[Contact]:
-    """Attach contacts, see ``Contact.attach``; returns these, followed by the second parts of contacts with corners (collective)."""
+    """Attach contacts, see ``Contact.attach``; returns these, followed by their further parts (collective)."""
     for contact in contacts:
         contact.attach(config, free, **clock)
     refuse_shared_pressures(config, contacts)
-    if not any(contact.corners for contact in contacts):
-        return list(contacts)
-    from uem_dolfinx.contact.corner_contact import with_corners
+    return [*contacts, *(part for contact in contacts for part in _further_parts(contact, config, free, clock))]
 
-    return with_corners(contacts, config, free, clock)
+
+def _further_parts(contact: Contact, config: Configuration, free: Bools, clock: dict[str, Any]) -> Sequence[FurtherPart]:
+    """Attached further parts of a contact, at corners and edges (collective).
+
+    Raises:
+        InputError: for a contact that cannot have what it is given.
+    """
+    wanted = [word for word in ("corners", "edges") if getattr(contact, word)]
+    found: list[FurtherPart] = []
+    if wanted and not _takes_parts(contact):
+        raise InputError(
+            f"contact '{contact.name}': {wanted[0]} = True goes with hard node-to-surface contact of two meshes, without tied, "
+            f"adjust, wear, heat, cohesion, leak and friction by area or temperature: leave {wanted[0]} out, or these"
+        )
+    order = -1 - next(_orders) if wanted else -1
+    if contact.corners:
+        from uem_dolfinx.contact.further.corners import corners_of
+
+        found += corners_of(contact, config, order)
+    if contact.edges:
+        from uem_dolfinx.contact.further.edges import edges_of
+
+        found += edges_of(contact, config, order)
+    contact.further = found
+    for part in found:
+        part.attach(config, free, **clock)
+        part.share()
+    return found
+
+
+def _takes_parts(contact: Contact) -> bool:
+    """Whether other nodes or edges could have equations, too."""
+    from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
+    from uem_dolfinx.geometry.search import MeshTarget
+
+    law = as_law(contact.friction)
+    plain = not (
+        contact.tied or contact.adjust or contact.wears or contact.heats or contact.normal or contact.cohesion or contact.leak
+    )
+    nodal = isinstance(contact.pair.discretisation, NodeToSurface) and contact.coupling == "node_to_surface"
+    meshed = isinstance(contact.pair.target, MeshTarget) and contact.contactor.dim == contact.config.tdim - 1
+    return plain and nodal and meshed and not (law.per_area or isinstance(law.field, OfTemperature))
 
 
 def join_alike(contacts: Sequence[Contact]) -> None:
@@ -78,7 +123,7 @@ def _kind(contact: Contact) -> Hashable:
     if not rigid and not (type(contact) is Contact and type(pair.target) is MeshTarget):
         return None
     nodal = (type(pair), type(pair.discretisation)) == (Interface, NodeToSurface)
-    if not nodal or contact.at_corners is not None or pair.sliding != "finite" or pair.tie is not None or pair.heats:
+    if not nodal or contact.further or pair.sliding != "finite" or pair.tie is not None or pair.heats:
         return None
     if pair.friction is not None and not _joins(pair.friction):
         return None

@@ -177,11 +177,15 @@ class ContactResults(HeatResults):
 
     def pressing(self) -> tuple[Array, Array]:
         """Normal ``(n_contactors,)`` and tangential forces ``(n_contactors, gdim)`` that are divided by ``measured_areas`` (collective)."""
-        return self._with_corners(*self.pair.pressing())
+        return self._with_further(*self.pair.pressing())
 
-    def _with_corners(self, across: Array, along: Array) -> tuple[Array, Array]:
-        """The forces, with those of a second part of the contact (collective)."""
+    def _with_further(self, across: Array, along: Array) -> tuple[Array, Array]:
+        """The forces, with those of further parts of the contact (collective)."""
         return across, along
+
+    def acting_at(self) -> Array:
+        """Points of the contactors' bodies where the contact forces act ``(n_contactors, gdim)``."""
+        return self.pair.points
 
     def leads(self) -> Bools:
         """Contactors that conduct heat when they touch; only one of two that follow each other ``(n_contactors,)`` (collective)."""
@@ -235,7 +239,7 @@ class ContactResults(HeatResults):
         if self.contactor.dim > 0:
             normal = None if self.coupling == "mortar" else self.pair.projection.normal
             areas = self._seam.evenly(self.nodes, self.surface.of_functions(self.nodes, normal, lambda shape: basis_of(shape).T))
-            pressed, _ = self._with_corners(*self.pair.pressing())
+            pressed, _ = self._with_further(*self.pair.pressing())
             f.x.array[: self.config.n_owned] = density(self.config, self.contactor, self.nodes, pressed, areas)
             f.x.scatter_forward()
         return f
@@ -372,7 +376,7 @@ class ContactResults(HeatResults):
         given.word("on", on, ("contactor", "target"))
         target, p, g = self.pair.target, self.pair.projection, self.config.gdim
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
-        x, f = self.pair.points, self.pair.trial.force
+        x, f = self.acting_at(), self.pair.trial.force
         if on == "target":
             # a gap kept by a tie moves with the target
             x, f = np.where(self.pair.tied[:, None], x, p.foot), -f

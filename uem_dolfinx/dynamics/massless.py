@@ -36,7 +36,7 @@ def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
     Raises:
         MassError: if the other nodes of a body cannot take the mass of its contactors; it names the part that could be massless.
     """
-    config, contacts = mass.config, [c for c in contacts if c.tied is not True and not c.is_second_part]
+    config, contacts = mass.config, [c for c in contacts if c.tied is not True and not c.is_further_part]
     of_all = [contact for contact in contacts if contact.of_all_surfaces]
     named = [contact for contact in contacts if not contact.of_all_surfaces]
     contactors, spare = contactor_nodes(named), np.zeros(config.n_owned, bool)
@@ -75,7 +75,7 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
     """
     config, K = mass.config, None
     massy: Bools = np.asarray(mass.of_nodes.any(axis=1))
-    for contact in (c for c in contacts if c.tied is not True and not c.is_second_part):
+    for contact in (c for c in contacts if c.tied is not True and not c.is_further_part):
         kept = _followed(config, contact)[: config.n_owned] & massy
         bare = not massy[contact.pair.nodes].any()
         if not reduced(config.comm, int(kept.any())) or not reduced(config.comm, int(bare), op=MPI.MIN):

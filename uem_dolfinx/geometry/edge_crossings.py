@@ -59,6 +59,7 @@ class SharpLines:
 
     Args:
         facets: of the surface.
+        of: those of which every edge has one at least ``(m,)``; None: all.
 
     Attributes:
         facet: this rank's facet of each piece ``(k,)``.
@@ -70,9 +71,12 @@ class SharpLines:
         total: number of pieces over all ranks.
     """
 
-    def __init__(self, facets: TargetFacets):
+    def __init__(self, facets: TargetFacets, of: Bools | None = None):
         self.facets, config = facets, facets.config
         convex = sharp_edges(facets).convex
+        if of is not None:
+            ours = sums_by_keys(config.comm, facets.side_keys(), np.repeat(of, len(facets.shape.edges)).astype(float)[:, None])
+            convex &= ours.reshape(convex.shape) > 0
         facet, side = np.nonzero(convex)
         of_sides, own = facets.side_keys()[convex.ravel()], facets.keys[facet]
         other = sums_by_keys(config.comm, of_sides, own[:, None])[:, 0] - own

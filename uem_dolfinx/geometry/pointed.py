@@ -33,11 +33,10 @@ class PointedFacets(TargetFacets):
 
 def pointed_sides(facets: TargetFacets) -> Bools:
     """Sides of a surface's facets on pointed edges of its body, also where the surface ends there ``(m, n_sides)`` (collective)."""
-    config = facets.config
-    convex = sharp_edges(facets, POINTED).convex
-    if not reduced(config.comm, bool(facets.open_sides.any()), op=MPI.LOR):
+    convex, (whole, _) = sharp_edges(facets, POINTED).convex, with_outside(facets)
+    if whole is facets:
         return convex
-    on = _with_neighbours(config, facets)
+    on = whole.on_sides(sharp_edges(whole, POINTED).convex)
     ends = np.stack([on[facets.dofs[:, nodes]].all(axis=1) for _, nodes, _, _ in facets.shape.edges], axis=1)
     return np.asarray(convex | (facets.open_sides & ends))
 
@@ -50,14 +49,17 @@ def sizes_at(facets: TargetFacets, nodes: Indices) -> Array:
     return np.asarray(sums[0] / np.maximum(sums[1], 1.0))
 
 
-def _with_neighbours(config: Configuration, facets: TargetFacets) -> Bools:
-    """Local nodes on pointed edges of the surface and of the outside next to its ends ``(n_local,)`` (collective)."""
+def with_outside(facets: TargetFacets) -> tuple[TargetFacets, Bools]:
+    """A surface with the facets of the body's outside next to its ends, and which of these are its own ``(m,)`` (collective)."""
+    config = facets.config
+    if not reduced(config.comm, bool(facets.open_sides.any()), op=MPI.LOR):
+        return facets, np.ones(len(facets.dofs), bool)
     outside = exterior_facets(config)
     of = nodes_of_facets(config, outside)
     beside = facets.on_sides(facets.open_sides)[of.dofs].any(axis=1)
     entities = np.union1d(facets.entities, outside.entities[of.own][beside]).astype(np.int32)
     whole = TargetFacets(config, Tag(facets.tag.name, 0, config.tdim - 1, config.mesh, entities))
-    return whole.on_sides(sharp_edges(whole, POINTED).convex)
+    return whole, np.isin(whole.entities, facets.entities)
 
 
 class AtEdges:

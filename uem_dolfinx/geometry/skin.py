@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -20,9 +19,6 @@ from uem_dolfinx.geometry.sharp import SHARP_EDGE, pairs_of_equals, sharp_edges
 from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced
-
-if TYPE_CHECKING:
-    from uem_dolfinx.geometry.edge_crossings import Crossings
 
 #: Bodies whose facets differ less in size are equally fine; of these the smaller body follows.
 #: [convention; ratio of sizes; test_skin.py::test_the_finer_follows]
@@ -52,9 +48,6 @@ class Skin(TargetFacets):
         area: sum over each body's facets of their mean side, in 3D its square ``(n_bodies,)``.
         extent: diagonal of each body's bounding box in the reference configuration ``(n_bodies,)``.
     """
-
-    #: Crossings of its sharp edges, if these are in contact.
-    crossings: Crossings | None = None
 
     def __init__(self, config: Configuration, tag: Tag):
         super().__init__(config, tag, "surface")

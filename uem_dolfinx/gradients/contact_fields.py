@@ -30,8 +30,8 @@ def check_field(problem: UnitedProblem, what: str, m: fem.Function) -> None:
     for contact in problem.contacts:
         called, pair = f"{what}, '{m.name}', of contact '{contact.name}'", contact.pair
         rubs, thickens = as_law(contact.friction).field is m, contact.offset is m
-        if (rubs or thickens) and contact.corners_touch():
-            raise InputError(f"{called}: its target's corners touch: expected corners=False")
+        if (rubs or thickens) and contact.further_parts_touch():
+            raise InputError(f"{called}: its target's corners or edges touch: expected corners=False, edges=False")
         if thickens and (not pair.discretisation.traits.pointwise or isinstance(pair.discretisation, Bernstein)):
             raise InputError(
                 f"{called}, is an offset: there is no derivative by its values with mortar or degree 2, whose gaps are of several nodes: "

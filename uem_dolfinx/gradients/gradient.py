@@ -351,8 +351,10 @@ def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> 
     known = any(contact is m.contact for contact in problem.contacts)
     given.kind(what, m, known, "a parameter of a contact of the problem")
     refuse_parameter(m, what)
-    if m.contact.corners_touch():
-        raise InputError(f"{what} is of contact '{m.contact.name}', whose target's corners touch: expected corners=False")
+    if m.contact.further_parts_touch():
+        raise InputError(
+            f"{what} is of contact '{m.contact.name}', whose corners or edges touch: expected corners=False, edges=False"
+        )
     if m.parameter == "friction" and not m.contact.pair.frictional:
         raise InputError(
             f"{what} is the friction of contact '{m.contact.name}', which has none: expected a contact with friction"

@@ -48,17 +48,17 @@ class PressureSlopes:
         equations: of its pair, in the present state.
 
     Raises:
-        InputError: if corners of the target touch, or a concave corner holds contactors, whose pressures come from several facets with
+        InputError: if further parts touch, or a concave corner holds contactors, whose pressures come from several facets with
             rotating normals; also at sharp edges of contactors, without mortar.
     """
 
     def __init__(self, contact: Contact, equations: ContactRows):
         self.contact, self._pair, self._equations = contact, contact.pair, equations
         self._config, self._current = contact.config, contact.measure == "current"
-        if contact.corners_touch():
+        if contact.further_parts_touch():
             raise InputError(
-                f"contact '{contact.name}': corners of the target touch, and pressures with their forces have no derivatives here; take "
-                "corners=False, or forces"
+                f"contact '{contact.name}': corners or edges touch, and pressures with their forces have no derivatives here; take "
+                "corners=False, edges=False, or forces"
             )
         held = self._pair.trial.active & self._pair.trial.in_corner
         if reduced(self._config.comm, int(held.sum())):

@@ -100,7 +100,7 @@ class EnergyBook(Closing, given.Sealed):
         self.momenta: list[Array] = []
         self.impulses: list[Array] = []
         axes, names = "xyz"[: problem.config.gdim], [f.name for f in fields(Energies)]
-        self._contacts = [contact for contact in problem.contacts if not contact.is_second_part]
+        self._contacts = [contact for contact in problem.contacts if not contact.is_further_part]
         suffixes = contact_suffixes(self._contacts)
         columns = [*names, *(f"momentum_{a}" for a in axes), *(f"impulse_{a}{s}" for s in suffixes for a in axes)]
         resume_at = self.dynamics if resume else None

@@ -210,14 +210,16 @@ class GeneralContact(OfProblem, given.Sealed):
         # as many bodies as meet another one at a corner in a grid of blocks
         n_lists = 2**self._config.gdim - 1
         neighbours = Neighbours(skin, own, place, apart, bound, n_lists, itself)
+        crossings = None
+        if self.edges:
+            from uem_dolfinx.contact.general.edges import crossings_of, edge_contacts
+
+            crossings = crossings_of(neighbours, bound)
         together: list[AmongContact] = []
         for k in range(n_lists):
-            together.append(AmongContact(neighbours, k, together, name=self._name(k), normals=self.normals, **options))
-        if not self.edges or self._config.gdim < 3:
-            return list(together)
-        from uem_dolfinx.contact.general.edges import edge_contacts
-
-        return [*together, *edge_contacts(neighbours, bound, self.name, options)]
+            name = self._name(k)
+            together.append(AmongContact(neighbours, k, together, crossings, name=name, normals=self.normals, **options))
+        return [*together, *(() if crossings is None else edge_contacts(neighbours, crossings, self.name, options))]
 
     def _mortar(
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]

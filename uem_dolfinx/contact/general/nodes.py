@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices
+from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.nodes.bernstein import Bernstein
 from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics, NodeToSurface
 from uem_dolfinx.contact.seam.state import PairState
@@ -31,16 +31,7 @@ class AmongBodies(NodeToSurface):
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
         self.target.hold(np.where(state.active, state.facet, -1))
-        self.left_out = self._at_crossings()
         return super().place(points, state)
-
-    def _at_crossings(self) -> Bools | None:
-        """Contactors at crossings of edges with the body on this list ``(n,)`` (collective); None without contact between edges."""
-        n = self.target.neighbours
-        if n.skin.crossings is None:
-            return None
-        n.update()
-        return n.skin.crossings.hold(self.nodes, n.body[self.target.number], n.skin.n_bodies)
 
     def _asks(self, state: PairState) -> bool:
         """Whether the list has a pair, or a contactor is active, on any rank (collective)."""

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.general.mortar import Body
     from uem_dolfinx.contact.general.pair_friction import ValuesOfPairs
     from uem_dolfinx.contact.warnings.edges_inside import Meeting
+    from uem_dolfinx.geometry.edge_crossings import Crossings
     from uem_dolfinx.geometry.neighbours import Neighbours
+    from uem_dolfinx.geometry.projection import FacetProjection
     from uem_dolfinx.geometry.skin import Skin
 
 
@@ -83,10 +85,6 @@ class BodiesContact(GeneralPart):
         """Numbers of the bodies opposite to contactors ``(n,)``, -1 for no body (collective)."""
         return np.asarray(skin.values_at(self.on_skin(self.pair.projection.facet), skin.body))
 
-    def acting_at(self) -> Array:
-        """Points of contactors' bodies where the contact forces act ``(n, gdim)``."""
-        return self.pair.points
-
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
         """Values by the body opposite to contactors ``(n,)``; None if they do not depend on it (collective)."""
         if self._by_pairs is None:
@@ -102,7 +100,9 @@ class BodiesContact(GeneralPart):
 class AmongContact(BodiesContact):
     """Part of a general contact: every node with one nearby body."""
 
-    def __init__(self, neighbours: Neighbours, number: int, together: list[AmongContact], **options: Any):
+    def __init__(
+        self, neighbours: Neighbours, number: int, together: list[AmongContact], crossings: Crossings | None, **options: Any
+    ):  # fmt: skip
         from uem_dolfinx.contact.general.nodes import AmongBodies, AmongQuadraticBodies
 
         skin = neighbours.skin
@@ -110,12 +110,26 @@ class AmongContact(BodiesContact):
         coupling: Any = AmongQuadraticBodies if quadratic else AmongBodies
         super().__init__(skin.tag, skin.tag, coupling=coupling, **options)
         self._neighbours, self._number, self._skin = neighbours, number, skin
-        self._together = together
+        self._together, self._crossings = together, crossings
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         from uem_dolfinx.geometry.neighbours import Neighbour
 
         return self._neighbours.nodes, Neighbour(self._neighbours, self._number, averaged=self.normals == "averaged")
+
+    def _discretised(self, nodes: Indices, target: Any, **how: Any) -> tuple[Any, None]:
+        """Nodes, without those at crossings of edges with the body on this list."""
+        found: Any = super()._discretised(nodes, target, **how)[0]
+        crossings, n = self._crossings, self._neighbours
+
+        def at_crossings(_: FacetProjection) -> Bools:
+            n.update()
+            assert crossings is not None
+            return crossings.hold(nodes, n.body[self._number], n.skin.n_bodies)
+
+        if crossings is not None:
+            found.leave(at_crossings, n.number)
+        return found, None
 
     def pressing(self) -> tuple[Array, Array]:
         """Forces, including forces from nodes of the other body that follow this node at sharp edges (collective)."""

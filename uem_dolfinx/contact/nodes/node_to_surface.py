@@ -6,7 +6,7 @@ contactor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
@@ -43,12 +43,10 @@ class NodeToSurface(OnTarget):
     traits = Traits(at_feet=True, pointwise=True, chained=False, two_pass=True)
     #: Whether an end of the target holds contactors that first touch there, for all or for each ``(n,)``.
     ends_hold: bool | Bools = True
-    #: Contactors that something else holds, so that they must not touch the target ``(n,)``, or None.
-    left_out: Bools | None = None
     #: In place of ``ConcaveEdges``, see ``follow_by``.
     _edges: Any = None
-    #: Which contactors are left to other equations, see ``leave``; None: none are.
-    _leaves: Callable[[FacetProjection], Bools] | None = None
+    #: Which contactors are left to other equations, see ``leave``.
+    _leaves: Sequence[Callable[[FacetProjection], Bools]] = ()
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -81,9 +79,10 @@ class NodeToSurface(OnTarget):
         #: Followed nodes of the last call ``(n, nt)``, and their free components ``(n, nt, gdim)``.
         self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
 
-    def leave(self, which: Callable[[FacetProjection], Bools], order: int, *, ends_hold: bool = True) -> None:
+    def leave(self, which: Callable[[FacetProjection], Bools], order: int, *, ends_hold: bool | None = None) -> None:
         """Leave contactors, ``which (n,)`` by their projection (collective), to another contact; both share an order of bodies."""
-        self._leaves, self.ends_hold, self.traits = which, ends_hold, self.traits._replace(order=order)
+        self._leaves, self.traits = [*self._leaves, which], self.traits._replace(order=order)
+        self.ends_hold = self.ends_hold if ends_hold is None else ends_hold
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
@@ -101,7 +100,8 @@ class NodeToSurface(OnTarget):
             else:
                 nearest = projection = self.on_target(points, self.anchor)
         moves = self._target_moves(projection) if self.setting.prescribed else None
-        out = None if self._leaves is None else self._leaves(cast("FacetProjection", nearest))
+        left = [which(cast("FacetProjection", nearest)) for which in self._leaves]
+        out = np.any(left, axis=0) if left else None
         return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves, out=out), state)
 
     def _asks(self, state: PairState) -> bool:
@@ -225,8 +225,7 @@ class NodalKinematics(PlacedOnTarget):
     @cached_property
     def ends(self) -> Ends:
         """Open ends, which can hold contactors; see ``Kinematics``."""
-        out = self.of.left_out if self.out is None else self.out
-        return Ends(self.projection, self.of.thickness, self.of.ends_hold, out=out)
+        return Ends(self.projection, self.of.thickness, self.of.ends_hold, out=self.out)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

@@ -69,8 +69,6 @@ def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) 
         for law in friction.values() if isinstance(friction, Mapping) else (friction,):
             if isinstance(law, ViscousFriction):
                 raise InputError(f"{name} has friction = {law!r}, which does not go with CentralDifferences: {remedy}")
-        if getattr(contact, "corners", False):
-            raise InputError(f"{name} has corners = True, which does not go with CentralDifferences: {remedy}")
-        for what in ("normal", "cohesion", "leak"):
+        for what in ("corners", "normal", "cohesion", "leak", *(() if isinstance(contact, GeneralContact) else ("edges",))):
             if law := getattr(contact, what, None):
                 raise InputError(f"{name} has {what} = {law!r}, which does not go with CentralDifferences: {remedy}")

@@ -168,9 +168,7 @@ class Stage:
             part_contacts(problem)
         bodies, held = problem.bodies, problem.bodies.held
         parts = [
-            (part, on)
-            for one, on in step.contacts.items()
-            for part in (one.parts_with_corners if isinstance(one, Contact) else one.parts)
+            (part, on) for one, on in step.contacts.items() for part in (one.all_parts if isinstance(one, Contact) else one.parts)
         ]
         left, come = ([part for part, on in parts if on is not part.on and on is which] for which in (False, True))
         acting = reactions(problem) if fresh and problem.progress.steps else None

@@ -51,13 +51,13 @@ def touching(problem: Any) -> list[bool]:
     """Whether each contact has active contactors (collective)."""
     if not problem.contacts:
         return []
-    active = np.array([any(part.pair.united.any() for part in one.parts_with_corners) for one in problem.contacts])
+    active = np.array([any(part.pair.united.any() for part in one.all_parts) for one in problem.contacts])
     return list(map(bool, reduced(problem.comm, active, op=MPI.LOR)))
 
 
 def events(problem: Any, before: list[bool], after: list[bool]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the contacts that have closed, and of those that have opened, by whether each had active contactors."""
-    # second parts come last
-    names = [contact.name for contact in problem.contacts if not contact.is_second_part]
+    # further parts come last
+    names = [contact.name for contact in problem.contacts if not contact.is_further_part]
     touched = tuple(name for name, was, now in zip(names, before, after) if now and not was)
     return touched, tuple(name for name, was, now in zip(names, before, after) if was and not now)
