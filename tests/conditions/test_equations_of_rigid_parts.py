@@ -139,6 +139,18 @@ def test_values_follow_the_load(law):
             assert bar.displacement[1] == pytest.approx(0.01 * step.factor**2, rel=1e-10)
 
 
+def test_a_linked_part_without_stress():
+    """A box moves as a whole, and one that an equation of turns links to it stays at rest: rounding is no force at work."""
+    r = Row()
+    sides = [r.scene.tag(f"side {i}", i, lambda x, at=at: x[:, 0] == at) for i, at in enumerate((2.0, 2.5))]
+    ends = [r.scene.tag(f"end {i}", i, lambda x, at=at: x[:, 0] == at) for i, at in enumerate((0.0, 4.5))]
+    terms = ((2.0, 0.0), (0, 1.0)), ((2.0, 1.0), (0, -1.0)), ((2.5, 0.0), (0, -1.0)), ((2.5, 1.0), (0, 1.0))
+    bcs = [uem.dirichlet(r.V, ends[0]), uem.dirichlet(r.V, ends[1], None, (0.0, -0.05))]
+    a, b = (uem.RigidCoupling(side, r.at(2.25)) for side in sides)
+    r.problem([a, b], [r.equation(*terms)], law=lambda u, E: linear(u, 1e3), bcs=bcs).solve()
+    assert np.allclose(b.displacement, (0.0, -0.05), atol=1e-13) and np.abs(a.displacement).max() <= 1e-13
+
+
 def test_conditions_are_replaced():
     """Equations of rigid parts are made anew with other conditions, and hold as before."""
     r = Row()

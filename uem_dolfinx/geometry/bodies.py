@@ -65,6 +65,15 @@ def find_bodies(nodes: Nodes) -> tuple[Ints, int]:
     return _FOUND[nodes]
 
 
+def linked_bodies(nodes: Nodes, node: Indices, followed: Ints) -> tuple[Ints, int]:
+    """As ``find_bodies``, with bodies as one between which there is a pair of an owned node and a global one ``(k,)`` (collective)."""
+    body, count = find_bodies(nodes)
+    there = nodes.ask_owners(followed, body[: nodes.n_owned, None].astype(float))[:, 0].astype(np.int64)
+    pairs = np.unique(np.column_stack([body[node], there]), axis=0)
+    n, group = _components(count, np.concatenate(nodes.comm.allgather(pairs)))
+    return group[body], n
+
+
 def _find_bodies(nodes: Nodes, cells: Indices) -> tuple[Ints, int]:
     label = fem.Function(nodes.V)
     view = label.x.array.reshape(-1, nodes.block)

@@ -134,10 +134,9 @@ class UnitedProblem(given.Sealed):
             checks.check_residual(F, u)
             self.load = check_load(load)
             bcs = checks.check_conditions(self.config, bcs)
-            kinds = Contact | GeneralContact
+            kinds, what = Contact | GeneralContact, "an Equation, or what periodic returns"
             contacts = given.items("contacts", contacts, lambda one: isinstance(one, kinds), "a Contact or a GeneralContact")
             check_new(contacts)
-            what = "an Equation, or what periodic returns"
             equations = given.items("equations", equations, lambda one: hasattr(one, "n_values"), what)
             couplings, linked = checks.check_couplings(couplings)
             points = given.items(
@@ -268,7 +267,8 @@ class UnitedProblem(given.Sealed):
             from uem_dolfinx.conditions.user_rows import rows_of_users
 
             free, nodes = self.bodies.free[: self.config.n_owned], [pair.nodes for pair in self.pairs]
-            self.linear = rows_of_users(self.config, equations, couplings, free, nodes + followed, load, at)
+            self.linear = linear = rows_of_users(self.config, equations, couplings, free, nodes + followed, load, at)
+            self.bodies.link(linear and linear.equations)
 
     def hold(self, bcs: Sequence[fem.DirichletBC]) -> None:
         """Replace all Dirichlet conditions between two time steps; in statics use ``Step(bcs=...)`` (collective).

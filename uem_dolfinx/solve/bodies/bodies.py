@@ -18,9 +18,9 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import check_fields
-from uem_dolfinx.arrays import AnyArray, Array, Bools, largest_of_groups
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, largest_of_groups
 from uem_dolfinx.errors import InputError, NotFiniteError
-from uem_dolfinx.geometry.bodies import find_bodies
+from uem_dolfinx.geometry.bodies import find_bodies, linked_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.parallel import agreed, reduced
@@ -107,18 +107,22 @@ class Bodies:
         self.wanted: Array = np.array(self.u.x.array)
         self.dead: Array | None = None
         self.stiffness: Array | None = None
-        #: Its value at the end of the last step, which the next step starts with.
+        #: Its value at the end of the last step, with which the next starts, and the state counter of the K that it was taken from.
         self.stiffness_at_start: Array | None = None
-        #: State counter of the values of K that ``stiffness`` was taken from.
         self._stiffness_of = -1
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self.inversions = Inversions(config) if check and config.moves else None
         self._fields: Any = None
+        self._linked: tuple[Ints, int] | None = None
         if self.unknowns.mixed:
             from uem_dolfinx.solve.bodies.field_scales import FieldScales
 
             #: Sizes of the terms in the equations of other fields; None without any.
             self._fields = FieldScales(self.unknowns, self.tangent)
+
+    def link(self, eq: Any) -> None:
+        """Take bodies that ``UnitingEquations`` of users connect as one, where forces are told from rounding (collective)."""
+        self._linked = linked_bodies(self.config, eq.node[eq.row], eq.followed)
 
     def begin_step(self) -> None:
         """Scale other fields by K at the beginning of the step, as a run restarted from a checkpoint does (collective)."""
@@ -244,7 +248,7 @@ class Bodies:
     def above_rounding(self, positioned: bool) -> Any:
         """Norm of the forces, or one for each field, at the components where they exceed rounding (collective).
 
-        Rounding of a body's displacement affects all of its nodes, also nodes with Dirichlet conditions.
+        Rounding of a body's displacement affects all of its nodes, also nodes with Dirichlet conditions, and bodies that are linked to it.
 
         Args:
             positioned: whether positions are rounded, not displacements alone.
@@ -252,7 +256,7 @@ class Bodies:
         if self.stiffness is None:
             return self.unknowns.norms(self.residual)
         F, n = self.forces, self.config.n_owned
-        body, count = find_bodies(self.config)
+        body, count = self._linked or find_bodies(self.config)
         rounded = largest_of_groups(body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0), count)
         self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
         own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
@@ -415,9 +419,8 @@ class Bodies:
 
     def from_checkpoint(self, u: fem.Function | None) -> None:
         """Restore the diagonal of K from a checkpoint; None if it was not known."""
-        n = self.config.n_owned * self.config.block
-        self.stiffness = None if u is None else np.array(u.x.array[:n]).reshape(-1, self.config.block)
-        self.stiffness_at_start = self.stiffness
+        n, g = self.config.n_owned, self.config.block
+        self.stiffness = self.stiffness_at_start = None if u is None else np.array(u.x.array[: n * g]).reshape(n, g)
 
 
 def configured(u: fem.Function, displacement: int | None) -> Configuration:
