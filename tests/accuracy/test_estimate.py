@@ -16,7 +16,8 @@ from dolfinx import fem
 from helpers import blocks, highest, modulus, refused, slow, st_venant
 
 import uem_dolfinx as uem
-from uem_dolfinx import forms
+from uem_dolfinx import compat, forms
+from uem_dolfinx.accuracy.first_guess import carry_over
 
 COMM = MPI.COMM_WORLD
 
@@ -41,6 +42,56 @@ def test_effectivity(degree, finer, coupling):
     assert max(ratios) < 1.05 * min(ratios)
     order = np.log2(found[1][0].total / found[2][0].total)
     assert abs(order - (1.0, 1.5)[degree - 1]) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("degree, finer", [(1, 1.0), (1, 2.0), (2, 1.0), (2, 2.0)])
+def test_five_meshes(degree, finer, coupling):
+    """The ratio of the estimate to the error varies by less than 10 % while the error falls by a factor of 16 or 60."""
+    ratios = [estimate.relative / error for estimate, error in (westergaard(n, degree, coupling, finer) for n in (2, 4, 8, 16, 32))]
+    assert min(ratios) > 0.75 and max(ratios) < 1.1 * min(ratios) < 1.0
+
+
+def hertz(n, coupling, friction, degree=2):
+    """A disc pressed on a block, three times as stiff, with n cells along a unit of length at the contact."""
+    mesh, tags = uem.read_gmsh(
+        uem.example_mesh("hertz_cylinder"), COMM, gdim=2, parameters={"h": 1 / n, "ratio": 1.4, "order": degree, "zone": 0.3}
+    )
+    V = uem.function_space(mesh, degree, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = uem.LinearElastic(modulus_of(mesh, tags), 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["disc_top"], 1, -0.05)]
+    bcs += [uem.dirichlet(V, tags["block_bottom"]) if friction else uem.dirichlet(V, tags["block_bottom"], 1)]
+    contact = uem.Contact(tags["disc_arc"], tags["block_top"], coupling=coupling, friction=friction)
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
+    list(uem.load_steps(problem, 2))
+    return problem
+
+
+def modulus_of(mesh, tags):
+    E = fem.Function(compat.function_space(mesh, ("DG", 0)))
+    E.x.array[:] = 1.0
+    E.x.array[tags["disc"].entities] = 3.0
+    return E
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_five_meshes_of_a_disc(coupling, friction):
+    """The same for Hertz with quadratic curved cells, against a mesh of twice as many, from one cell at the contact on."""
+    fine = hertz(96, coupling, friction)
+    F, V, exact = fine.bodies.F, fine.u.function_space, fine.u.x.array.copy()
+    for n in (3, 6, 12, 24, 48):
+        problem = hertz(n, coupling, friction)
+        carry_over(problem, fine)
+        away = fem.Function(V)
+        away.x.array[:] = exact - fine.u.x.array
+        fine.u.x.array[:] = exact
+        work = ufl.replace(ufl.derivative(F, fine.u, away), {F.arguments()[0]: away})
+        error = np.sqrt(COMM.allreduce(fem.assemble_scalar(forms.form(work))))
+        assert 0.7 < uem.error_estimate(problem).total / error < 1.3
 
 
 @pytest.mark.parametrize("degree", [1, 2])
