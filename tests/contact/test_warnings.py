@@ -131,6 +131,30 @@ def test_contactors_that_are_left_inside(depth, free, left_out, refused, size):
         checks.check_prescribed(seen)
 
 
+@pytest.mark.parametrize("pull, refused", [(3e-9, False), (3e-8, True), (2e-3, True)])
+@pytest.mark.parametrize("size", [1e-6, 1e3])
+def test_contactors_that_pull(pull, refused, size):
+    """Of hard contact no equilibrium has one, except by rounding; those that laws or ties hold may pull."""
+    b = blocks(COMM, "quadrilateral", 2, 2, pose=lambda x: size * x)
+    pair = uem.UnitedProblem(linear(b.u, 1.0), b.u, contacts=[uem.Contact(b.high, b.low)]).contacts[0].pair
+    n = len(pair.nodes)
+    lam = np.where(pair.config.X[pair.nodes, 0] > 0.9 * size, -pull, 1.0) * size
+
+    def seen(active=True, tied=False, law=False):
+        trial = SimpleNamespace(active=np.full(n, active), lam=lam, has_law=law)
+        return SimpleNamespace(
+            name_at=lambda i: pair.name, config=pair.config, nodes=pair.nodes, tied=np.full(n, tied), trial=trial
+        )
+
+    for other in (seen(active=False), seen(tied=True), seen(law=True)):
+        checks.check_signs([other], [np.zeros(n)])
+    checks.check_signs([seen()], [np.full(n, 3.0 * pull * size)])
+    if refused:
+        raised(uem.ConvergenceError, "pulls with", lambda: checks.check_signs([seen()], [np.zeros(n)]))
+    else:
+        checks.check_signs([seen()], [np.zeros(n)])
+
+
 # -- curved meshes -----------------------------------------------------------------------------------------------------
 
 

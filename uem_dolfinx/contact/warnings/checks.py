@@ -17,7 +17,7 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING
-from uem_dolfinx.errors import ConflictError, OverdeterminedError, PenetrationError, SpaceError
+from uem_dolfinx.errors import ConflictError, ConvergenceError, OverdeterminedError, PenetrationError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
@@ -30,6 +30,9 @@ from uem_dolfinx.parallel import agree, reduced
 #: Largest penetration of contactors whose equations depend on other equations.
 #: [convention; the model's size; test_warnings.py::test_contactors_that_are_left_inside]
 LEFT_OUT = 1e-6
+#: A force of the wrong sign is a pull if it is above this part of the largest contact force; rounding of positions makes smaller ones.
+#: [convention; the largest contact force; test_warnings.py::test_contactors_that_pull]
+PULLS = 1e-8
 #: Surfaces conform if their clearance is below the sag of the facets on more facets than this, in every direction.
 #: [convention; facets; test_warnings.py::test_surfaces_that_conform]
 CONFORMING = 4
@@ -110,6 +113,36 @@ def check_prescribed(pair: Interface) -> None:
             "by Dirichlet conditions or other contacts on both sides of the tie, and neither side can move: release one of them"
         )
     agree(pair.config.comm, error)
+
+
+def check_signs(pairs: Sequence[Interface], rounding: Sequence[Array]) -> None:
+    """Refuse an equilibrium with a hard contactor that pulls, by whatever way it was found (collective).
+
+    Equations that depend on each other, and corners whose facets share a force, leave the sign of single forces to other rules.
+
+    Args:
+        pairs: of all contacts.
+        rounding: smaller forces are zero, of each pair ``(n,)``.
+
+    Raises:
+        ConvergenceError: names the contactor that pulls the most, on the first rank with one.
+    """
+    hard = [(pair, least, pair.trial) for pair, least in zip(pairs, rounding) if not pair.trial.has_law]
+    if not hard:
+        return
+    comm, error = hard[0][0].config.comm, None
+    largest = reduced(comm, max(float(t.lam.max(initial=0.0)) for _, _, t in hard), op=MPI.MAX)
+    for pair, least, t in hard:
+        pull = np.where(t.active & ~pair.tied, -t.lam, 0.0)
+        if (pull > np.maximum(least, PULLS * largest)).any():
+            i = int(np.argmax(np.where(pull > least, pull, 0.0)))
+            error = ConvergenceError(
+                f"{pair.name_at(i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))} pulls with {pull[i]:.3g}, where the "
+                f"largest contact force is {largest:.3g}: no active set with forces of one sign was found; take smaller load steps, "
+                "or exchange the two surfaces"
+            )
+            break
+    agree(comm, error)
 
 
 def warn_of_straight_facets(config: Configuration, name: str, tags: list[Tag]) -> None:

@@ -18,7 +18,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.pair.interface import Interface, in_question
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.placement import Traction
-from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed
+from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed, check_signs
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
@@ -161,6 +161,7 @@ class BodySystem:
         """Refuse an equilibrium with conflicting contacts and conditions, or one of several equilibria (collective)."""
         for pair in self.near:
             check_prescribed(pair)
+        check_signs(self.near, [self.bodies.rounding_at(pair.nodes) for pair in self.near])
         if self.linear is not None:
             self.linear.check()
         self.floating.end_step()
