@@ -45,8 +45,8 @@ STAGES = (
     "corners of the target", "cross out prescribed components", "deflation", "eigenvalues", "estimate errors",
     "factorisation or preconditioner set-up", "first acceleration", "inertia forces", "linear solve", "projection", "read checkpoint",
     "read mesh", "redistribute mass", "restriction matrix P", "return mapping", "search", "search and projection", "segments",
-    "solve without the contact", "united matrix", "united matrix P'KP", "united matrix P'MP", "united matrix Q'KP", "uniting equations",
-    "write checkpoint", "write fields", "write surfaces", "write table",
+    "solve without the contact", "united matrix", "united matrix P'KP", "united matrix Q'KP", "united matrix of explicit steps",
+    "uniting equations", "write checkpoint", "write fields", "write surfaces", "write table",
 )  # fmt: skip
 #: Stages that have been timed so far, in the order of their first time.
 _stages: dict[str, None] = {}

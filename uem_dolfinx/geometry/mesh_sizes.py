@@ -28,7 +28,7 @@ OTHERS = {
     "Mesh.MeshSizeMax": 1e22, "Mesh.MeshSizeFactor": 1.0,
 }  # fmt: skip
 #: Gmsh gives sizes to triangles and tetrahedra; quadrilaterals and hexahedra that these are subdivided into are so much smaller.
-#: [measured; size; test_mesh_sizes.py::test_subdivided_cells_have_their_sizes]
+#: [convention; size; test_mesh_sizes.py::test_subdivided_cells_have_their_sizes]
 SUBDIVIDED = 2.5
 
 
