@@ -164,7 +164,7 @@ class Condensed:
         nodes = self._touched(P, Q, G, followed, holding=False)
         if self._is_of(K) and not self._begins:
             nodes |= self._nodes
-        known = self._known
+        known = self._known if self._is_of(K) else None
         self.drop()
         # an increment of this K serves whichever nodes C has, and whether or not an earlier attempt has left its C
         self._known = known
