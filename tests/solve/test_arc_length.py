@@ -160,6 +160,7 @@ def test_loads_that_are_not_proportional():
     arch = Arch(squared)
     led = ArcLength(arch.problem)
     led.begin(0.5, np.zeros(arch.problem.bodies.displacement().local_size), 1.0)
+    led.begin_step()
     arch.problem.bodies.assemble()
     led._differentiate()
     slope = arch.problem.bodies.residual.copy()
