@@ -64,6 +64,8 @@ for step in uem.time_steps(problem, end=gap / v0 + 1.15 * lasts):
     if step.number % 10 == 0:
         row = book.write(step)
     rows.append((step.time, plane.resultant().force[1], plane.n_active))
+    if rows[-1][1] >= max(row[1] for row in rows):
+        flattest = u.x.array.copy()
 book.close()
 
 # %% [markdown]
@@ -88,7 +90,12 @@ common.report(args, results)
 # %%
 if args.plot:
     with uem.figure(args.plot, comm, panels=2, size=(5.0, 4.0)) as (left, right):
-        uem.plot_scene(problem, left, mirror=True)
+        u.x.array[:] = flattest
+        a = np.sqrt(approach * R)
+        uem.plot_scene(
+            problem, left, field=material.stress(u)[1, 1] / (1.5 * largest / (np.pi * a**2)), mirror=True,
+            label="vertical stress at the turn / $p_0$", window=(-4 * a, 4 * a, -a, 6 * a),
+        )  # fmt: skip
         if right is not None:
             d, w, path = 0.0, v0, [(0.0, 0.0)]
             for k in range(1, 4001):
