@@ -180,7 +180,7 @@ def adapt(
                 aim *= tolerance / found[-1].known
             wanted = reduced(mesh.comm, float(estimate.shares.sum())) * (aim * tolerance / found[-1].known) ** power
         if size is not None:
-            scale *= float(np.clip((found[-1].cells / expected) ** (1.0 / mesh.topology.dim), 0.5, 2.0))
+            scale *= float(np.clip(found[-1].cells / expected, 0.5, 2.0)) ** (1.0 / mesh.topology.dim)
             scale = scale if tolerance is None else min(scale, 1.0)
         factors = size_factors(estimate.shares, problem.config.degree, mesh.topology.dim, mesh.comm, wanted, cells)
         lengths = cell_sizes(mesh)

@@ -32,6 +32,11 @@ OTHERS = {
 SUBDIVIDED = 2.5
 
 
+#: Copies of simplices at the boundary are so many times as large, so that they reach to arcs of 90 degrees along a side.
+#: [convention; size of a cell; test_adapt.py::test_cells_in_space]
+BEYOND = 2.0
+
+
 class MeshSizes:
     """Lengths of edges that Gmsh is to give cells, linear in the cells of an earlier mesh (collective).
 
@@ -70,6 +75,8 @@ class MeshSizes:
         corners = np.array(FILLED_BY[self.cell])
         gdim, k = self.points.shape[2], corners.shape[1]
         points, values = self.points[:, corners].reshape(-1, k, gdim), self.values[:, corners].reshape(-1, k)
+        if k == 4:
+            points, values = _beyond(points, values)
         x = np.zeros((len(points), 3, k))
         x[:, :gdim] = points.transpose(0, 2, 1)
         data = np.concatenate([x.reshape(len(x), -1), values], axis=1)
@@ -87,6 +94,22 @@ class MeshSizes:
             for name, value in before.items():
                 gmsh.option.setNumber(name, value)
             gmsh.view.remove(view)
+
+
+def _beyond(points: Array, values: Array) -> tuple[Array, Array]:
+    """Simplices ``(m, k, gdim)`` and their values ``(m, k)``, with copies at the boundary that reach to curved surfaces outside.
+
+    Gmsh 4.8 knows no size where there is no simplex, and meshes such surfaces in space much coarser; curves in the plane keep theirs.
+    """
+    m, k = values.shape
+    vertex = np.unique(points.reshape(m * k, -1), axis=0, return_inverse=True)[1].reshape(m, k)
+    facets = np.sort(np.concatenate([np.delete(vertex, i, axis=1) for i in range(k)]), axis=1)
+    alone, times = np.unique(facets, axis=0, return_counts=True)
+    outside = np.isin(vertex, alone[times == 1]).any(axis=1)
+    middle, mean = points[outside].mean(axis=1, keepdims=True), values[outside].mean(axis=1, keepdims=True)
+    larger = middle + BEYOND * (points[outside] - middle)
+    there = np.maximum(mean + BEYOND * (values[outside] - mean), values[outside].min(axis=1, keepdims=True))
+    return np.concatenate([points, larger]), np.concatenate([values, there])
 
 
 def _unique(numbers: Ints) -> tuple[Ints, int]:
