@@ -109,7 +109,7 @@ class Prediction:
 
 def _in_cells(F: ufl.Form, cells: npt.ArrayLike) -> ufl.Form | None:
     """A form whose integrals over cells are restricted to some cells ``(n,)``; None if they have other marks than MeshTags."""
-    integrals = []
+    integrals, mesh = [], F.arguments()[0].ufl_function_space().mesh
     for integral in F.integrals():
         of = integral.subdomain_data()
         if integral.integral_type() == "cell":
@@ -118,7 +118,7 @@ def _in_cells(F: ufl.Form, cells: npt.ArrayLike) -> ufl.Form | None:
                 if not hasattr(of, "indices"):
                     return None
                 own = np.intersect1d(cells, of.indices[np.isin(of.values, ids.astype(np.int32))])
-            tags = forms.mesh_tags(F.arguments()[0].ufl_function_space().mesh, F.ufl_domain().topological_dimension(), own, 1)
+            tags = forms.mesh_tags(mesh, mesh.topology.dim, own, 1)
             integral = integral.reconstruct(subdomain_data=tags, subdomain_id=1)
         integrals.append(integral)
     return ufl.Form(integrals)
