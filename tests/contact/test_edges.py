@@ -13,10 +13,9 @@ import ufl
 from benchmarks.scenes import box
 from block_scenes import st_venant
 from dolfinx import fem
-from edge_scenes import COMM, E, crossed, rod, rods, roofs, turned
+from edge_scenes import COMM, E, crossed, goes_on_from_checkpoints, rod, rods, roofs, turned
 from helpers import coulomb, factors, gathered_matrix, highest, refused, run, slow
 from petsc4py import PETSc
-from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -221,15 +220,7 @@ def test_checkpoints(friction, folder):
         how = {"length": 12.0, "angle": 1.0, "along": (0.7, 1.3), "law": st_venant, "friction": friction, "way": (0.4, 0.2, -0.5)}
         return rods((11, 12), on_edge=False, **how)
 
-    whole = begun()
-    run(whole.problem, 4)
-    for stop in (2, 9):
-        r = begun()
-        for step in uem.load_steps(r.problem, 4, checkpoint=uem.Checkpoint(folder / "run", every=1)):
-            if step.number == stop:
-                break
-    assert r.problem.progress.steps == 4
-    goes_on_alike(r.problem.u.x.array, whole.problem.u.x.array)
+    goes_on_from_checkpoints(begun, folder)
 
 
 def test_refused():

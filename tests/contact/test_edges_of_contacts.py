@@ -10,9 +10,8 @@ import pytest
 from benchmarks.scenes import box
 from block_scenes import st_venant
 from body_scenes import fork, skin_of
-from edge_scenes import COMM, crossed, folded, rods, roofs, turned
+from edge_scenes import COMM, crossed, folded, goes_on_from_checkpoints, rods, roofs, turned
 from helpers import at, coulomb, refused, run, slow
-from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx.contact.general.edges import crossings_of
@@ -134,14 +133,7 @@ def test_checkpoints(friction, folder):
     def begun():
         return rods((11, 12), on_edge=False, friction=friction, surfaces=OUTSIDE, edges=True, corners=True, **OBLIQUE)
 
-    whole = begun()
-    run(whole.problem, 4)
-    for stop in (2, 9):
-        r = begun()
-        for step in uem.load_steps(r.problem, 4, checkpoint=uem.Checkpoint(folder / "run", every=1)):
-            if step.number == stop:
-                break
-    goes_on_alike(r.problem.u.x.array, whole.problem.u.x.array)
+    goes_on_from_checkpoints(begun, folder)
 
 
 @pytest.mark.parametrize("how", [{"coupling": "mortar"}, {"sliding": "small"}, {"tied": True}, {"friction": uem.Tresca(1.0)}])

@@ -14,6 +14,8 @@ from block_scenes import linear
 from body_scenes import without
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
+from helpers import run
+from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
 
@@ -206,3 +208,21 @@ def folded(
 
     body = without(whole, hole).mapped(moved)
     return crossed("hexahedron", [body], [lambda x: ends(x, 0), lambda x: ends(x, 1)], way, R=R, max_penetration=0.5, **how)
+
+
+def goes_on_from_checkpoints(begun, folder):
+    """Assert that a run of four steps that goes on from a checkpoint ends like one that was left alone.
+
+    Args:
+        begun: makes the scene, with its ``problem``.
+        folder: of the checkpoint.
+    """
+    whole = begun()
+    run(whole.problem, 4)
+    for stop in (2, 9):
+        r = begun()
+        for step in uem.load_steps(r.problem, 4, checkpoint=uem.Checkpoint(folder / "run", every=1)):
+            if step.number == stop:
+                break
+    assert r.problem.progress.steps == 4
+    goes_on_alike(r.problem.u.x.array, whole.problem.u.x.array)

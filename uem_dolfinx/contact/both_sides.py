@@ -97,8 +97,8 @@ class OfBothSides(ContactResults):
         for part in self.further:
             row, node, weight = part.pair.kinematics.means()[int(part.swaps)]
             normal, tangential = part.pair.pressing()
-            told = np.column_stack([normal, -tangential if part.swaps else tangential])[row] * weight[:, None]
-            received = self.config.add_at_owners(node, told)[self.pair.nodes]
+            given = np.column_stack([normal, -tangential if part.swaps else tangential])[row] * weight[:, None]
+            received = self.config.add_at_owners(node, given)[self.pair.nodes]
             more = np.column_stack([self.pair.discretisation.spread(component) for component in received.T])
             across, along = across + more[:, 0], along + more[:, 1:]
         return across, along

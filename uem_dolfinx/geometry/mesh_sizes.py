@@ -34,7 +34,7 @@ SUBDIVIDED = 2.5
 
 #: Copies of simplices at the boundary are so many times as large, so that they reach to arcs of 90 degrees along a side.
 #: [convention; size of a cell; test_adapt.py::test_cells_in_space]
-BEYOND = 2.0
+ENLARGED = 2.0
 
 
 class MeshSizes:
@@ -107,8 +107,8 @@ def _beyond(points: Array, values: Array) -> tuple[Array, Array]:
     alone, times = np.unique(facets, axis=0, return_counts=True)
     outside = np.isin(vertex, alone[times == 1]).any(axis=1)
     middle, mean = points[outside].mean(axis=1, keepdims=True), values[outside].mean(axis=1, keepdims=True)
-    larger = middle + BEYOND * (points[outside] - middle)
-    there = np.maximum(mean + BEYOND * (values[outside] - mean), values[outside].min(axis=1, keepdims=True))
+    larger = middle + ENLARGED * (points[outside] - middle)
+    there = np.maximum(mean + ENLARGED * (values[outside] - mean), values[outside].min(axis=1, keepdims=True))
     return np.concatenate([points, larger]), np.concatenate([values, there])
 
 

@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, product, rows_at, together
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.arrays import Ints
 from uem_dolfinx.dynamics.explicit.part_solver import PartSolver
 from uem_dolfinx.geometry.nodes import Nodes
 
@@ -38,6 +39,6 @@ class SurfaceSolver(PartSolver):
         self._factorise(nodes, product(test.transposed, forces), self._diagonal, False)
 
 
-def numbers(space: Nodes, own: np.ndarray) -> PETSc.IS:
+def numbers(space: Nodes, own: Ints) -> PETSc.IS:
     """Global numbers of owned unknowns ``(n,)``."""
     return PETSc.IS().createGeneral((own + space.block * space.first).astype(PETSc.IntType), comm=space.comm)
