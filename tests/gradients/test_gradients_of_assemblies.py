@@ -51,14 +51,14 @@ def assembly(cell="triangle", sizes=(3, 4), feature=None, comm=COMM, top=True, b
             problem.solve()
             yield
 
-    def solve(steps=1, recorded=False, dynamics=False):
+    def solve(steps=1, recorded=False, dynamics=False, **wanted):
         """The sum of J over all steps, or time steps up to a time, after which the problem and its history are at hand."""
         b.u.x.array[:], later.value[:], total = 0.0, 0.0, 0.0
         made = feature(s, **how)
         bcs = s.bcs[:1] if dynamics else s.bcs
         made |= {"dynamics": uem.Dynamics(uem.lumped_mass(b.V, 1.0))} if dynamics else {}
         s.problem = uem.UnitedProblem(F, b.u, bcs=bcs, rtol=1e-13, **made)
-        with uem.recording(s.problem) if recorded else nullcontext() as s.history:
+        with uem.recording(s.problem, **wanted) if recorded else nullcontext() as s.history:
             for _ in uem.time_steps(s.problem, 0.2, steps) if dynamics else steps_of(s.problem, steps):
                 total += uem.integrate(s.J)
         return total
@@ -93,19 +93,20 @@ def shortening(s, **how):
     return {"contacts": [uem.Preload(s.b.high, s.b.low, shortening=float(length), **how)]}
 
 
-def coupling(s, distribute=False, joints=None, contact=None, **how):
+def coupling(s, distribute=False, joints=None, contact=None, larger=1, rotations="large", **how):
     """The top as a rigid part, loaded at a point."""
     force, moment = constant(s, "force of the coupling", [0.01, *[0.0] * (s.g - 2), -0.03]), None
-    moment = constant(s, "moment of the coupling", 0.004 if s.g == 2 else [0.001, 0.002, 0.0])
-    one = uem.RigidCoupling(s.b.top, (*[0.5] * (s.g - 1), 1.2), force=force, moment=moment, distribute=distribute)
+    moment = constant(s, "moment of the coupling", 0.004 if s.g == 2 else larger * np.array([0.001, 0.002, 0.0]))
+    loads = {"force": force, "moment": moment, "rotations": rotations}
+    one = uem.RigidCoupling(s.b.top, (*[0.5] * (s.g - 1), 1.2), distribute=distribute, **loads)
     contacts = tie(s)["contacts"] if contact is None else [uem.Contact(s.b.high, s.b.low, **contact)]
     return {"contacts": contacts, "couplings": [one, *([] if joints is None else joints(one))], **how}
 
 
-def led(s, **how):
-    """The top as a rigid part, whose motion is given."""
-    motion = [constant(s, f"motion[{i}]", x) for i, x in enumerate((0.02, -0.05, 0.03))]
-    one = uem.RigidCoupling(s.b.top, (0.5, 1.2), motion=motion)
+def led(s, target=False, **how):
+    """The top, or the surface of the lower block, as a rigid part whose motion is given."""
+    motion = [constant(s, f"motion[{i}]", x) for i, x in enumerate((0.02, 0.05 if target else -0.05, 0.03))]
+    one = uem.RigidCoupling(s.b.low if target else s.b.top, (0.5, 1.2), motion=motion)
     return {"contacts": [pressing(s, **how)], "couplings": [one]}
 
 
@@ -235,18 +236,20 @@ FEATURES = {
     "preload by mortar": (preload, {"coupling": "mortar"}, (*ALL, "force")),
     "preload, locked": (preload, AXIS | {"locked": True}, (*ALL, "force")),
     "shortening": (shortening, AXIS, (*ALL, "shortening", "X")),
-    "coupling": (coupling, {}, (*FREE, *LOADS)),
+    "coupling": (coupling, {}, (*FREE, *LOADS, "X")),
     "coupling, mortar": (coupling, {"contact": {"tied": True, "coupling": "mortar"}}, (*FREE, *LOADS)),
-    "coupling in space": (coupling, {"cell": "tetrahedron", "sizes": (2, 2)}, (*FREE, *LOADS)),
-    "coupling, spring": (coupling, {"joints": sprung}, (*FREE, *LOADS)),
-    "coupling, hinge": (coupling, {"joints": hinged}, (*FREE, LOADS[1])),
-    "coupling, led": (led, {}, (*FREE, *MOTION, "offset")),
-    "coupling, led, friction": (led, {"friction": 0.3}, (*FREE, *MOTION)),
+    "coupling in space": (coupling, {"cell": "tetrahedron", "sizes": (2, 2), "gap": 0.05, "larger": 20}, (*FREE, *LOADS, "X")),
+    "coupling, spring": (coupling, {"joints": sprung}, (*FREE, *LOADS, "X")),
+    "coupling, spring, small rotations": (coupling, {"joints": sprung, "rotations": "small"}, (*FREE, *LOADS, "X")),
+    "coupling, hinge": (coupling, {"joints": hinged}, (*FREE, LOADS[1], "X")),
+    "coupling, led": (led, {}, (*FREE, *MOTION, "offset", "X")),
+    "coupling, led, friction": (led, {"friction": 0.3}, (*FREE, *MOTION, "X")),
+    "coupling of the target, led": (led, {"target": True}, (*ALL, *MOTION, "offset", "X")),
     "coupling, equation": (relation, {}, (*FREE, LOADS[0], "b of the equation")),
     "equation": (equation, {}, (*ALL, "b of the equation", "offset", "X")),
     "mean motion": (mean, {}, (*ALL, "mean motion", "offset")),
     # a slider takes all of a moment
-    "coupling, slider": (coupling, {"joints": sliding}, (*FREE, LOADS[0])),
+    "coupling, slider": (coupling, {"joints": sliding}, (*FREE, LOADS[0], "X")),
     "force and spring at nodes": (points, {}, (*ALL, "force at a node", "offset", "X")),
 }  # fmt: skip
 NEEDS_HISTORY = ("tie, friction beside it", "preload, locked", "coupling, led, friction")
@@ -389,7 +392,7 @@ REFUSED = {
     "the shape, ties of hexahedra": (tie, {"cell": "hexahedron", "sizes": (2, 3)}, "X", "ties of hexahedra", False),
     "the shape, a section without axis": (preload, {}, "X", "expected an axis", False),
     "the shape, mean motions": (mean, {}, "X", "with a MeanMotion", False),
-    "the shape, couplings": (led, {}, "X", "by the shape with couplings", False),
+    "the shape, equations of rigid parts": (relation, {}, "X", "by the shape with couplings", False),
     "the offset of a tie": (tie, {}, "offset", "which is tied", False),
     "a locked preload without its history": (preload, AXIS | {"locked": True}, "E", "depends on earlier steps", False),
     "the shape, a locked preload": (preload, AXIS | {"locked": True}, "X", "an opening that changes with the shape", True),
@@ -401,7 +404,7 @@ REFUSED = {
 def test_refused(what, monkeypatch):
     """By name, and before anything is solved."""
     feature, how, name, words, recorded = REFUSED[what]
-    s = assembly(feature=feature, top=feature not in (coupling, led), **how)
+    s = assembly(feature=feature, top=feature not in (coupling, relation), **how)
     if feature is after:
         refused(uem.InputError, words, lambda: s.solve(1, True))
         return
@@ -413,6 +416,32 @@ def test_refused(what, monkeypatch):
         words,
         lambda: (s.history.gradient if recorded else lambda J, m: uem.gradient(s.problem, J, m))(s.J, control),
     )
+
+
+#: What is refused before the first step of a history, by the derivatives that are announced.
+ANNOUNCED = {
+    "the shape, ties by mortar": (tie, {"coupling": "mortar"}, False, lambda s: {"controls": s.X}, "ties by mortar"),
+    "the shape, equations of rigid parts": (relation, {}, False, lambda s: {"controls": [s.E, s.X]}, "with couplings"),
+    "the shape in time": (tie, {}, True, lambda s: {"controls": [s.X]}, "no derivatives by it in time"),
+    "the displacement": (tie, {}, False, lambda s: {"controls": [s.u]}, "which the problem solves for"),
+    "a tangent in time": (tie, {}, True, lambda s: {"tangent": True}, "tangents of histories are of statics"),
+}
+
+
+@pytest.mark.parametrize("what", ANNOUNCED)
+def test_refused_before_the_first_step(what):
+    """A history is told what it is for."""
+    feature, how, dynamics, wanted, words = ANNOUNCED[what]
+    s = assembly(feature=feature, top=feature is not relation, **how)
+    refused(uem.InputError, words, lambda: s.solve(1, True, dynamics, **wanted(s)))
+    assert s.problem.progress.steps == 0 and s.problem.history is None
+
+
+def test_announced_and_taken():
+    """Controls that have derivatives change nothing."""
+    s = assembly(feature=tie)
+    s.solve(2, True, controls=[s.E, s.X], tangent=True)
+    assert len(s.history.gradient(s.J, [s.E, s.X])) == len(s.history.tangent([(s.E, 1.0)])) == 2
 
 
 def test_pressures_of_ties():

@@ -108,8 +108,6 @@ class RigidRows:
         self._began: list[Array | None] = [None] * len(couplings)
         self.at_present()
 
-    # -- steps -------------------------------------------------------------------------------------------------------------
-
     def values(self) -> Array:
         """Present values of the prescribed components and, after them, of the rows of links ``(k,)`` (collective)."""
         return np.concatenate([*(one.wanted() for one in self.couplings), self._linked.values()])
@@ -227,8 +225,6 @@ class RigidRows:
             force, moment = np.split(work[s[i]], [g])
             one.read_reactions(forces, force, moment - moments(aim.at[i].arms(one.point[None])[0], force))
         self._linked.read(aim.at, of_joints)
-
-    # -- rows --------------------------------------------------------------------------------------------------------------
 
     def aim(self) -> Aim:
         """Placements for linearisation, and the rows and residuals there (collective)."""
@@ -400,17 +396,20 @@ class RigidRows:
                 G[s[i], s[i]] = (one.added.factor if factor is None else factor) * one.added.mass_of(self._linearised.at[i])
         return self._at_basis(G)
 
+    @property
+    def motions(self) -> Array:
+        """Motions of the sets for unit components of the basis ``(n_z, k)``."""
+        return (self._inverse * self.set.scale[:, None])[:, : len(self.basis.node)]
+
     def _at_basis(self, G: Array) -> tuple[Ints, Array]:
         """A matrix of motions ``(n_z, n_z)`` as global nodes ``(1, n)`` and block ``(1, n gdim, n gdim)`` of the basis, on one rank."""
         config, g, basis = self._config, self._config.gdim, self._basis
         assert basis is not None
-        (nodes, which), T = basis.nodes, (self._inverse * self.set.scale[:, None])[:, : len(basis.node)]
+        (nodes, which), T = basis.nodes, self.motions
         block = np.zeros((len(nodes), g, len(nodes), g))
         block[which[:, None], basis.component[:, None], which, basis.component] = T.T @ G @ T
         own = 1 if config.comm.rank == 0 else 0
         return np.tile(nodes, (own, 1)), np.tile(block.reshape(len(nodes) * g, -1), (own, 1, 1))
-
-    # -- components that the set keeps -------------------------------------------------------------------------------------
 
     def rows_of(self, basis: Basis, at: Sequence[Placement]) -> Array:
         """Rows B of the components q ``(k, n_z)``."""

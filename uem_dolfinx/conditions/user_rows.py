@@ -174,7 +174,7 @@ class UserRows:
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Geometric stiffness in the tangent: global nodes ``(k, n)`` and blocks ``(k, n gdim, n gdim)`` (collective)."""
-        parts = [one.curvature(forces) for one, forces in self._forces_of_each()] if self.turning else []
+        parts = [one.curvature(forces) for one, forces in self.forces_of_each()] if self.turning else []
         return [part for part in parts if part is not None]
 
     def added_mass(self, factor: float | None = None) -> list[tuple[Ints, Array]]:
@@ -189,7 +189,7 @@ class UserRows:
         """Equations of the motions that springs between couplings resist (collective)."""
         return [one.sprung() for one in self.each if one.springy]
 
-    def _forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
+    def forces_of_each(self) -> Iterator[tuple[RigidRows, Array]]:
         """The couplings' forces at the owned nodes ``(n_owned, gdim)`` (collective)."""
         start = 0 if self.linear is None else len(self.linear.equations)
         for one in self.each:
@@ -209,7 +209,7 @@ class UserRows:
         """End a step: refuse values that contradict each other, or Dirichlet values (collective)."""
         if self.linear is not None:
             self.linear.check()
-        for one, forces in self._forces_of_each():
+        for one, forces in self.forces_of_each():
             one.end_step(forces)
 
     def forces(self, multipliers: Array) -> Array:

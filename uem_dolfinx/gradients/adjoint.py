@@ -69,7 +69,7 @@ class Adjoint:
     @cached_property
     def by_gaps(self) -> Array:
         """Derivative by the gaps of all equations ``(m,)`` (first time: collective)."""
-        return -self.at.P.multipliers(self.at.P.pass_on(self.left))
+        return -self.at.followers.back(self.at.P.multipliers(self.at.P.pass_on(self.left)))
 
     @property
     def _at_nodes(self) -> Array:

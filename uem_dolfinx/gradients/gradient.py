@@ -81,10 +81,11 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
     refuse_idle_controls(problem, "controls", some, [J])
     from uem_dolfinx.gradients.adjoint import Adjoint
     from uem_dolfinx.gradients.linearised import Linearised
+    from uem_dolfinx.gradients.shape_slopes import warn_of_edges
 
     with Linearised(problem) as linearised:
         if any(isinstance(m, ufl.SpatialCoordinate) for m in some):
-            linearised.warn_of_edges()
+            warn_of_edges(problem)
         adjoint = Adjoint(linearised, revolved(J), pressing)
         return [adjoint.by(m) for m in some]
 
@@ -116,10 +117,11 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]],
             given.kind("of", of, bool(which), "the pressure of a contact of the problem, or None for the displacement")
         contact = problem.contacts[which[0]]
     from uem_dolfinx.gradients.linearised import Linearised
+    from uem_dolfinx.gradients.shape_slopes import warn_of_edges
 
     with Linearised(problem) as linearised:
         if any(isinstance(m, ufl.SpatialCoordinate) for m, _ in pairs):
-            linearised.warn_of_edges()
+            warn_of_edges(problem)
         motion = linearised.moved(pairs)
         return motion.du if contact is None else linearised.pressed(contact, motion)
 
@@ -232,10 +234,13 @@ def refuse_kept_projections(problem: UnitedProblem, steps: int) -> None:
             )
 
 
-def check_controls(problem: UnitedProblem, what: str, handed: Any) -> list[Any]:
-    """Refuse problems without a step, and items that are no controls or no pairs of a control and its change (collective)."""
+def check_controls(problem: UnitedProblem, what: str, handed: Any, later: bool = False) -> list[Any]:
+    """Refuse items that are no controls or no pairs of a control and its change, and problems without a step but for ``later`` use.
+
+    Collective.
+    """
     with agreed(problem.comm):
-        if not problem.progress.steps:
+        if not problem.progress.steps and not later:
             raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
         if what == "controls":
             controls = found = given.items(what, handed, lambda one: isinstance(one, AnyControl), A_CONTROL)

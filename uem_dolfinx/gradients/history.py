@@ -176,7 +176,7 @@ class History(given.Sealed):
         given_forms = [f for f in functionals if f is not None]
         refuse_without_state(problem, given_forms, self._state())
         refuse_idle_controls(problem, "controls", some, given_forms)
-        self._check_controls(some)
+        self.check_controls(some)
         self._refuse_moved_nodes()
         sweep = Sweep(problem, some)
         with self._replayed():
@@ -213,11 +213,10 @@ class History(given.Sealed):
         with agreed(problem.comm):
             if not len(self):
                 raise InputError("the history has no step: expected steps to be taken while it is recorded")
-            if problem.dynamics is not None:
-                raise InputError("tangents of histories are of statics: in time take the gradient of a functional")
+        self.check_tangent()
         controls = [control for control, _ in pairs]
         refuse_idle_controls(problem, "direction", controls)
-        self._check_controls(controls, "direction")
+        self.check_controls(controls, "direction")
         self._refuse_moved_nodes()
         from uem_dolfinx.gradients.forward import Forward
 
@@ -230,6 +229,12 @@ class History(given.Sealed):
                     self._place(record)
                 forward.advance(record)
         return forward.found
+
+    def check_tangent(self) -> None:
+        """Refuse problems of whose histories there is no tangent (collective)."""
+        with agreed(self.problem.comm):
+            if self.problem.dynamics is not None:
+                raise InputError("tangents of histories are of statics: in time take the gradient of a functional")
 
     @contextmanager
     def _replayed(self) -> Iterator[None]:
@@ -265,7 +270,7 @@ class History(given.Sealed):
                         "expected nodes that stay where they are while steps are recorded, and until there is a gradient"
                     )
 
-    def _check_controls(self, controls: Sequence[AnyControl], what: str = "controls") -> None:
+    def check_controls(self, controls: Sequence[AnyControl], what: str = "controls") -> None:
         """Refuse controls by which recorded steps have no derivatives (collective)."""
         problem, dynamics = self.problem, self.problem.dynamics
         load = problem.load if isinstance(problem.load, Mapping) else {}

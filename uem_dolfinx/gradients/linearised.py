@@ -46,8 +46,6 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.pair.interface import in_question
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
-from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.contact_fields import along_field
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
@@ -55,9 +53,10 @@ from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_o
 from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
 from uem_dolfinx.gradients.refused import refuse_sharp
-from uem_dolfinx.gradients.shape_slopes import ShapeSlopes, shape_slopes_of
+from uem_dolfinx.gradients.rigid_slopes import Followers, RigidSlopes, shape_slopes_of, skew_curvature
+from uem_dolfinx.gradients.shape_slopes import ShapeSlopes
 from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import gathered, reduced
+from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.norms import ratio
 from uem_dolfinx.solve.bodies.tangent import curvature_of, slip_terms, together
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -117,6 +116,8 @@ class Linearised:
         self.problem, self.config = problem, problem.config
         self.ramp = in_rows(problem, problem.progress.taken.held if held is None else held)
         self.K = self._K_back = problem.bodies.tangent.K
+        self.G: PETSc.Mat | None = None
+        self._G_back: PETSc.Mat | None = None
         # number of the displacement's components on this rank, which come first in vectors
         self._n = problem.config.n_owned * problem.config.gdim
         self.F = problem.bodies.F
@@ -141,6 +142,10 @@ class Linearised:
         # in addition to the curvature, springs between couplings
         self.K, self.G = self.problem.bodies.tangent.K, together(system.curvature, state.added)
         self._K_back = self.K if is_symmetric(self.K, self.config.unknowns) else transposed(self.K)
+        if (skew := None if self.problem.linear is None else skew_curvature(self.problem.linear, self.vector())) is not None:
+            self.G = together(self.G, skew)
+            self.problem.solver.set_operator(self.P, self.K, self.G)
+        self._G_back = self.G if skew is None else transposed(self.G)
         self._tell_idle()
 
     def _state(self) -> BodyState:
@@ -191,28 +196,10 @@ class Linearised:
                 "the contactors that are active now", idle,
             )  # fmt: skip
 
-    def warn_of_edges(self) -> None:
-        """Warn of contactors on edges between facets, where derivatives by the shape are one-sided (collective)."""
-        for contact, pair in zip(self.problem.contacts, self.problem.pairs):
-            p, place = getattr(pair.kinematics, "projection", None), np.full(3, np.nan)
-            on = np.zeros(len(pair.nodes), dtype=bool)
-            target, free = pair.target, contact.coupling == "node_to_surface" and not contact.tied
-            if free and isinstance(p, FacetProjection) and isinstance(target, MeshTarget):
-                on = pair.trial.active & (target.shape.side_distances(p.xi) < ON_SIDE).any(axis=1)
-                place[: self.config.gdim] = self.config.X[pair.nodes[on][0]] if on.any() else np.nan
-            if count := reduced(self.config.comm, int(on.sum())):
-                places = gathered(self.config.comm, place)[:, : self.config.gdim]
-                first = places[np.isfinite(places).all(axis=1)][0]
-                logger.warning(
-                    "contact '%s': %d contactor(s), the first at (%s), lie on edges between facets of the target, whose normals change "
-                    "differently on either side: derivatives by the shape are one-sided", contact.name, count,
-                    ", ".join(f"{x:.6g}" for x in first),
-                )  # fmt: skip
-
     def __exit__(self, *error: object) -> None:
         solver = self.problem.solver
         # the hierarchy is rebuilt, since steps must not depend on whether a gradient was computed
-        if solver.iterative or not solver.lasting or self._K_back is not self.K:
+        if solver.iterative or not solver.lasting or self._turns_back:
             self.problem.system.forget()
         self.problem.restore()
 
@@ -272,10 +259,15 @@ class Linearised:
         pairs = [pair for pair in in_question([self.problem.pairs[k] for k in which]) if pair.trial.has_law]
         return slip_terms(pairs, self.config.unknowns.vector())[0]
 
+    @property
+    def _turns_back(self) -> bool:
+        """Whether the adjoint problem has another matrix."""
+        return self._K_back is not self.K or self._G_back is not self.G
+
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``a = Q mu`` of the adjoint problem under forces (collective)."""
-        if self._K_back is not self.K:
-            self.problem.solver.set_operator(self.P, self._K_back, self.G)
+        if self._turns_back:
+            self.problem.solver.set_operator(self.P, self._K_back, self._G_back)
         return self.solve(forces)
 
     def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
@@ -284,7 +276,7 @@ class Linearised:
 
     def stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
         """``(K + G)' a`` (collective)."""
-        return forms.product(self._K_back, a, self.G)
+        return forms.product(self._K_back, a, self._G_back)
 
     def body_stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
         """``K' a`` (collective)."""
@@ -347,12 +339,17 @@ class Linearised:
         return gaps, pushed
 
     @cached_property
+    def followers(self) -> Followers:
+        """Equations in which rigid parts have taken the place of their nodes."""
+        return Followers(self.config, self.rows)
+
+    @cached_property
     def places(self) -> Places:
         """The shape as a control."""
         return Places(self.config)
 
     @cached_property
-    def shape_slopes(self) -> list[tuple[slice, ShapeSlopes]]:
+    def shape_slopes(self) -> list[tuple[slice, ShapeSlopes | RigidSlopes]]:
         """Derivatives of ties and users' equations by positions of nodes, each with its equations (first time: collective)."""
         found = shape_slopes_of(self.problem, self.equations)
         if found:
@@ -402,6 +399,7 @@ class Linearised:
             opened, pushed = slopes.along(drawn.array_r[: self._n].reshape(-1, config.gdim))
             gaps[which] += opened
             forces.array[: self._n] -= pushed.ravel()
+        gaps = self.followers.opened(gaps)
         c = self.P.carried(prescribed + np.where(bodies.free_rows, 0.0, drawn.array_r.reshape(-1, config.gdim)))
         c.axpy(-1.0, self.P.read_back(gaps))
         way = self.solve(forces - self.stiffness(c))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.law import as_law, follows_load
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.gradients.gradient import check_problem
+from uem_dolfinx.gradients.gradient import AnyControl, check_controls, check_problem
 from uem_dolfinx.gradients.history import History
 from uem_dolfinx.gradients.parameters import keeps_distance
 from uem_dolfinx.parallel import agreed
@@ -20,15 +20,22 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 @contextmanager
-def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> Iterator[History]:
+def recording(
+    problem: UnitedProblem,
+    *,
+    scratch: str | Path | None = None,
+    controls: Sequence[AnyControl] | AnyControl = (),
+    tangent: bool = False,
+) -> Iterator[History]:
     """Record all steps of a problem in a ``with`` block, for gradients through their history (collective).
 
     Example::
 
-        with uem.recording(problem) as history:
+        mu = uem.ContactParameter(contact, "friction")
+        with uem.recording(problem, controls=[E, mu]) as history:
             for step in uem.load_steps(problem, 10):
                 ...
-        by_E, by_mu = history.gradient(J, [E, uem.ContactParameter(contact, "friction")])
+        by_E, by_mu = history.gradient(J, [E, mu])
 
     A record contains the displacement, the history of contactors, laws and inertia, and the changed values of Constants and Functions in
     the residual.
@@ -37,6 +44,8 @@ def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> I
         problem: in statics or in time; supported are Coulomb friction between nodes of degree 1 and surfaces with sliding='finite', and
             ``VonMises`` as law with history.
         scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
+        controls: of the derivatives that are wanted later, if known: those without derivatives are refused before the first step.
+        tangent: likewise, whether ``tangent`` is wanted.
 
     Yields: The history, which may be used in the block and after it.
 
@@ -73,6 +82,12 @@ def recording(problem: UnitedProblem, *, scratch: str | Path | None = None) -> I
             history = History(problem, None if scratch is None else Path(scratch))
         except OSError as error:
             raise InputError(f"scratch = {scratch!r}: cannot write there ({error}); expected a folder on every rank") from error
+    given.kind("tangent", tangent, isinstance(tangent, bool), "True or False")
+    wanted = [controls] if isinstance(controls, AnyControl) else controls
+    if not isinstance(wanted, tuple) or wanted:
+        history.check_controls(check_controls(problem, "controls", wanted, later=True))
+    if tangent:
+        history.check_tangent()
     problem.history = history
     try:
         yield history

@@ -78,10 +78,11 @@ def refuse_sharp(contact: Contact) -> None:
 
 def refuse_shape(problem: UnitedProblem) -> None:
     """Refuse ties, preloads, equations and couplings without derivatives by the shape (to be agreed on)."""
-    if problem.couplings:
+    spread = any(getattr(one, "distribute", False) for one in problem.couplings)
+    if spread or (problem.linear is not None and any(one.n_relations for one in problem.linear.each)):
         raise InputError(
-            "there is no gradient by the shape with couplings, whose motions depend on the positions of all their nodes: expected a "
-            "problem without them, or other controls"
+            "there is no gradient by the shape with couplings that distribute a load or whose nodes equations hold, which depend on the "
+            "positions of these nodes: expected couplings without, or other controls"
         )
     for one in problem.equations:
         if not isinstance(one, Equation | Periodic):

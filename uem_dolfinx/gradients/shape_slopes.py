@@ -9,19 +9,20 @@ at the coordinates xi(X) and the height h(X):
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.conditions.united_rows import UnitedRows
-from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.contact.ties.preloaded import Preloaded
 from uem_dolfinx.contact.ties.tie import Tie
 from uem_dolfinx.contact.ties.tied_rows import Spacers, foot_below
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -56,28 +57,9 @@ class ShapeSlopes:
         return np.asarray(found + self.config.add_at_owners(at.ravel(), back))
 
 
-def shape_slopes_of(problem: UnitedProblem, equations: Sequence[ContactRows]) -> list[tuple[slice, ShapeSlopes]]:
-    """Of all ties and linear equations of a problem, each with its place among the equations of contacts and users (collective).
-
-    Args:
-        problem: in the state of the derivatives.
-        equations: of each of its pairs.
-    """
-    found, first = [], 0
-    for pair, own in zip(problem.pairs, equations):
-        if pair.tie is not None and pair.tie.rows is not None and pair.trial.bond is not None:
-            slopes = of_tie(pair.tie, pair.trial.bond)
-            found.append((slice(first + len(own) - len(slopes.rows[0]), first + len(own)), slopes))
-        first += len(own)
-    if problem.linear is not None and problem.linear.linear is not None:
-        linear = problem.linear.linear
-        found.append((slice(first, first + len(linear.equations)), of_equations(problem.config, linear)))
-    return found
-
-
-def of_equations(config: Configuration, rows: UnitedRows) -> ShapeSlopes:
+def of_equations(config: Configuration, eq: UnitingEquations) -> ShapeSlopes:
     """Of linear equations, whose coefficients are constant."""
-    eq, g = rows.equations, config.gdim
+    g = config.gdim
     widest = 1 + int(np.bincount(eq.row, minlength=1).max(initial=0))
     nodes = np.repeat(config.to_global(eq.node)[:, None], widest, axis=1)
     vectors = np.zeros((len(eq), widest, g))
@@ -132,3 +114,22 @@ def _foot_slopes(s: Spacers, N: Array) -> tuple[Array, Array]:
     # a rank without contactors has no width
     width = (1 + nn) * n.shape[1]
     return np.linalg.solve(m, T.reshape(k, fdim, width)), up.reshape(k, width)
+
+
+def warn_of_edges(problem: UnitedProblem) -> None:
+    """Warn of contactors on edges between facets, where derivatives by the shape are one-sided (collective)."""
+    for contact, pair in zip(problem.contacts, problem.pairs):
+        p, place = getattr(pair.kinematics, "projection", None), np.full(3, np.nan)
+        on = np.zeros(len(pair.nodes), dtype=bool)
+        target, free = pair.target, contact.coupling == "node_to_surface" and not contact.tied
+        if free and isinstance(p, FacetProjection) and isinstance(target, MeshTarget):
+            on = pair.trial.active & (target.shape.side_distances(p.xi) < ON_SIDE).any(axis=1)
+            place[: problem.config.gdim] = problem.config.X[pair.nodes[on][0]] if on.any() else np.nan
+        if count := reduced(problem.config.comm, int(on.sum())):
+            places = gathered(problem.config.comm, place)[:, : problem.config.gdim]
+            first = places[np.isfinite(places).all(axis=1)][0]
+            logger.warning(
+                "contact '%s': %d contactor(s), the first at (%s), lie on edges between facets of the target, whose normals change "
+                "differently on either side: derivatives by the shape are one-sided", contact.name, count,
+                ", ".join(f"{x:.6g}" for x in first),
+            )  # fmt: skip
