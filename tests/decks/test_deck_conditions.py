@@ -113,6 +113,89 @@ def test_hexahedra_bend_as_in_calculix(folder):
     assert deck.displacement(123) == pytest.approx([0.1165477, -0.00996147, -0.0296958], rel=1e-5)
 
 
+A = "*AMPLITUDE, NAME=a{}\n0., 0., 0.5, 1.,\n1., -0.5\n*AMPLITUDE, NAME=b\n0., 2., 4., 0.\n"
+COURSES = {
+    "its own time": ("", [f"*BOUNDARY, AMPLITUDE=A\n{EACH.format('3, -0.02')}", ""], lambda t: -0.02 * ramp(min(t, 2.0))),
+    "all the time": (", TIME=TOTAL TIME", [HOLD.format(-0.02).replace("RY", "RY, AMPLITUDE=a"), ""], lambda t: -0.02 * ramp(t)),
+    "forces, twice": ("", [f"*CLOAD, AMPLITUDE=a\n{HEAD}{HEAD}", ""], lambda t: -0.4 * ramp(min(t, 2.0))),
+    "then a ramp": ("", [HOLD.format(-0.02).replace("RY", "RY, AMPLITUDE=a"), HOLD.format(-0.03)], lambda t: upto(t, -0.03)),
+    "pressures, another one": (
+        "",
+        [f"*CLOAD, AMPLITUDE=a\n{HEAD}*DLOAD, AMPLITUDE=b\n11, P2, 50.\n", ""],
+        lambda t: -0.2 * ramp(min(t, 2.0)) - 0.1 * np.interp(min(t, 2.0), [0, 4], [2, 0]),
+    ),
+}
+
+
+def ramp(t):
+    """The amplitude ``a`` of ``A``."""
+    return float(np.interp(t, [0.0, 0.5, 1.0], [0.0, 1.0, -0.5]))
+
+
+def upto(t, end):
+    """The same in the first step, and from its end to another value in the second one."""
+    return -0.02 * ramp(t) if t <= 2.0 else 0.01 + (t - 2.0) / 2.0 * (end - 0.01)
+
+
+@pytest.mark.parametrize("case", COURSES)
+def test_amplitudes(folder, case):
+    """Values follow tables of times in their step, and stay as they are at its end, or of the time in all, in two steps of 2 s."""
+    how, steps, expected = COURSES[case]
+    text = column(*steps, thickness=A.format(how)).replace("*STATIC\n", "*STATIC\n0.25, 2.\n")
+    found, deck = heights(folder, text)
+    assert found == pytest.approx([expected(0.25 * (k + 1)) for k in range(16)], rel=1e-9, abs=1e-12)
+    assert not deck.left_out
+
+
+AXES = {
+    "inclined forces": ("R\n0.6, 0., 0.8, 0., 1., 0.", "*CLOAD\nhead 1, 1, 5.\nhead 1, 2, 1.\n", (0.312076, 0.1015008, 0.1451126)),
+    "inclined, held": ("R\n0.6, 0., 0.8, 0., 1., 0.", "*BOUNDARY\nhead 1, 1, 1, 0.01\n", (0.01242776, 0.0004986275, 0.003179179)),
+    "round forces": ("C\n.5, .25, 0., .5, .25, 1.", "*CLOAD\nhead 1, 1, 5.\nhead 1, 2, 1.\n", (9.756245e-3, 3.746153e-2, 2.073253e-2)),
+    "round, held": ("C\n.5, .25, 0., .5, .25, 1.", "*BOUNDARY\nhead 1, 1, 1, 0.01\nhead 1, 3, 3, 0.02\n", (-0.0151811, 8.001524e-3, 0.02)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", AXES)
+def test_local_directions(folder, case):
+    """Forces and prescribed values in the directions of a *TRANSFORM: displacements of CalculiX 2.20 for the same deck."""
+    axes, step, expected = AXES[case]
+    deck = read(folder, column(step, thickness=f"*TRANSFORM, NSET=head 1, TYPE={axes}\n"))
+    for _ in deck.run():
+        pass
+    assert deck.displacement(121) == pytest.approx(expected, rel=1e-6)
+    assert not deck.left_out
+
+
+def test_terms_of_equations_in_local_directions(folder):
+    """Two corners of the head move alike along a local direction, which is the column's axis, and are pushed along it."""
+    how = "*TRANSFORM, NSET=head 1, TYPE=R\n0., 0., 1., 1., 0., 0.\n*EQUATION\n2\n121, 1, 1., 122, 1, -1.\n"
+    deck = read(folder, column("*CLOAD\n121, 1, -5.\n", thickness=how))
+    for _ in deck.run():
+        pass
+    assert deck.displacement(121)[2] == pytest.approx(deck.displacement(122)[2], rel=1e-9)
+    assert deck.displacement(121)[2] < 0.0
+
+
+RIGID = "*NODE\n900, 0.5, 0.5, 3.\n901, 0., 0., 0.\n*RIGID BODY, NSET=head 1, REF NODE=900{}\n"
+BODIES = {
+    "pushed": (", ROT NODE=901", "*CLOAD\n900, 3, -100.\n", (0.0, 0.0, -0.2)),
+    "led": (", ROT NODE=901", "*BOUNDARY\n900, 3, 3, -0.02\n901, 1, 3\n", (0.0, 0.0, -0.02)),
+    "turned": (", ROT NODE=901", "*BOUNDARY\n900, 1, 3\n901, 1, 1, 0.01\n901, 2, 3\n", (0.0, 0.01, -0.005)),
+    "turned as in Abaqus": ("", "*BOUNDARY\n900, 1, 3\n900, 4, 4, 0.01\n900, 5, 6\n", (0.0, 0.01, -0.005)),
+}
+
+
+@pytest.mark.parametrize("case", BODIES)
+def test_rigid_bodies(folder, case):
+    """A rigid head, led or loaded at its reference nodes, halfway and at the end: the rigid motion of the corner at the origin."""
+    how, step, expected = BODIES[case]
+    text = column(step, nu=0.0, thickness=RIGID.format(how), held="*BOUNDARY\nfoot 1, 1, 3\n")
+    deck = read(folder, text.replace("*STATIC\n", "*STATIC\n0.5, 1.\n"))
+    for share, _ in zip((0.5, 1.0), deck.run()):
+        assert deck.displacement(121) == pytest.approx(share * np.array(expected), rel=1e-9, abs=1e-12)
+    assert not deck.left_out
+
+
 def test_thickness(folder):
     """Forces act on the thickness of plane bodies, pressures on an area; the deck says what contacts mean."""
     text = column("*CLOAD\nhead 1, 2, -5.\n", "*CLOAD, OP=NEW\n*DLOAD\n11, P3, 10.\n", kind="CPS4", thickness="0.1\n", held=FLAT)
@@ -147,6 +230,10 @@ def test_what_is_said(folder):
     ("old", "new", "said"),
     [
         ("*ELASTIC", "*ELASTIC, TYPE=ORTHO", ("TYPE=ORTHO", "ISO")),
+        ("*BOUNDARY\nhead", "*BOUNDARY, AMPLITUDE=none\nhead", ("no amplitude 'NONE'",)),
+        ("*BOUNDARY", "*AMPLITUDE, NAME=a, USER\n*BOUNDARY", ("by a function", "table")),
+        ("*BOUNDARY", "*AMPLITUDE, NAME=a\n1., 0., 1., 1.\n*BOUNDARY", ("times that grow",)),
+        ("*BOUNDARY", "*TRANSFORM, NSET=head 1\n1., 0., 0., 2., 0., 0.\n*BOUNDARY", ("no directions",)),
         ("*EXPANSION", "*EXPANSION, TYPE=ORTHO", ("TYPE=ORTHO", "ISO")),
         ("*BOUNDARY\nhead", "*BOUNDARY, FIXED\nhead", ("FIXED",)),
         ("head 1, 3", "head 1, 0", ("degree of freedom 0", "1 to 3")),

@@ -18,6 +18,7 @@ from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.conditions.at_points import PointLoad
 from uem_dolfinx.conditions.equation import Equation
+from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.conductance import Conductance
@@ -25,7 +26,7 @@ from uem_dolfinx.contact.laws.exponential import Exponential
 from uem_dolfinx.contact.laws.soft import SoftContact
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.decks.model import model_of
-from uem_dolfinx.decks.parts import TEMPERATURE, Interaction, Model, Pair, Step
+from uem_dolfinx.decks.parts import TEMPERATURE, Course, Interaction, Linear, Model, Pair, Step
 from uem_dolfinx.errors import InputError, MissingFileError, SpaceError, TagError
 from uem_dolfinx.geometry.axisymmetry import axisymmetric
 from uem_dolfinx.geometry.cuts import BACK, cut
@@ -107,8 +108,9 @@ class Deck(given.Sealed):
             displacement=0 if model.thermal else None,
             bcs=self._held(model.steps[0]),
             contacts=[*self.contacts.values(), *self.sections.values()],
-            equations=[self._equation(terms) for terms in model.equations],
+            equations=[self._equation(one) for one in model.equations],
             points=self._point_loads(),
+            couplings=[self._rigid(*one) for one in model.rigid],
         )
 
     def __repr__(self) -> str:
@@ -159,17 +161,16 @@ class Deck(given.Sealed):
         if step.kind == "STATIC" or step.steady:
             n = int(np.ceil(step.duration / step.first - SAME_LENGTH))
             begin = self._pass(np.inf)
-            yield OfUsers(
-                f"step {k + 1}", n, bcs=bcs, contacts=changed, friction=friction, loads=self._loads(k, 0.0), begin=begin
-            )
+            loads = self._loads(k, 0.0, 0.0, step.duration)
+            yield OfUsers(f"step {k + 1}", n, bcs=bcs, contacts=changed, friction=friction, loads=loads, begin=begin)
             return
         time, dt = 0.0, step.first
         while time < step.duration:
             dt = step.first if step.direct else min(dt, step.duration / LEAST_STEPS)
             end = time + dt if time + (1.0 + SAME_LENGTH) * dt < step.duration else step.duration
             # conditions of heat act in full from the beginning
-            begin = self._pass(end - time)
-            yield OfUsers(f"step {k + 1}", bcs=bcs, contacts=changed, friction=friction, loads=self._loads(k, 1.0), begin=begin)
+            begin, loads = self._pass(end - time), self._loads(k, 1.0, time, end)
+            yield OfUsers(f"step {k + 1}", bcs=bcs, contacts=changed, friction=friction, loads=loads, begin=begin)
             time, dt, changed, friction = end, dt * LONGER, {}, {}
 
     def _friction_of(self, k: int, step: Step) -> dict[Contact, Any]:
@@ -192,14 +193,21 @@ class Deck(given.Sealed):
 
         return begin
 
-    def _loads(self, k: int, start: float) -> Callable[[float], None]:
-        """Loads of step k from a part of its changes on."""
+    def _loads(self, k: int, start: float, since: float, until: float) -> Callable[[float], None]:
+        """Loads of step k from a part of its changes on, and from a time in it until another."""
+        began = sum(step.duration for step in self.steps[:k])
 
         def loads(s: float) -> None:
-            share = start + s * (1.0 - start)
+            share, time = start + s * (1.0 - start), since + s * (until - since)
             for driven, first, values in self._driven:
+                now = values[k]
+                if isinstance(now, Course):
+                    driven[...] = now.at(time, began + time)
+                    continue
                 before = values[k - 1] if k else first
-                driven[...] = before + share * (values[k] - before)
+                if isinstance(before, Course):
+                    before = before.at(self.steps[k - 1].duration, began)
+                driven[...] = before + share * (now - before)
 
         return loads
 
@@ -232,17 +240,41 @@ class Deck(given.Sealed):
     def _held(self, step: Step) -> list[fem.DirichletBC]:
         return [self._bcs[where] for where in step.held if where in self._bcs]
 
-    def _equation(self, terms: list[tuple[str, int, float]]) -> Equation:
-        axes = np.eye(self.mesh.geometry.dim)
-        return Equation([(self._tag(name), c * axes[dof - 1]) for name, dof, c in terms])
+    def _equation(self, one: Linear) -> Equation:
+        terms = [(self._tag(name), vector[: self.mesh.geometry.dim]) for name, vector in one.terms]
+        if not one.values:
+            return Equation(terms)
+        b = fem.Constant(self.mesh, 0.0)
+        self._drive(b.value, one.values)
+        return Equation(terms, b=b)
 
     def _point_loads(self) -> list[PointLoad]:
         g, t, found = self.mesh.geometry.dim, self._model.thickness, []
         for name in dict.fromkeys(name for step in self.steps for name, _ in step.forces if not self._is_reference(name)):
             force = fem.Constant(self.mesh, np.zeros(g))
-            self._drive(force.value, [np.array([s.forces.get((name, c), 0.0) / t for c in range(1, g + 1)]) for s in self.steps])
+            for c in range(g):
+                self._drive(force.value[c : c + 1], [step.forces.get((name, c + 1), 0.0) / t for step in self.steps])
             found.append(PointLoad(self._tag(name), force))
         return found
+
+    def _rigid(self, name: str, place: list[float], node: int, turning: int) -> RigidCoupling:
+        """A rigid body, led and loaded at its reference nodes; InputError if not all steps hold the same of these."""
+        g = self.mesh.geometry.dim
+        turns, motion = ((1, 2, 3) if g == 3 else (3,)), list[fem.Constant | None]()
+        force, moment = fem.Constant(self.mesh, np.zeros(g)), fem.Constant(self.mesh, np.zeros(3) if g == 3 else 0.0)
+        # rotations of a node of translations and rotations, or those of a node of their own
+        places = [(node, c) for c in range(1, g + 1)] + [(turning, c) if turning else (node, 3 + c) for c in turns]
+        for driven, at in zip([*force.value[:, None], *np.reshape(moment.value, (-1, 1))], places):
+            loads = [step.motions.get(("forces", *at), 0.0) / self._model.thickness for step in self.steps]
+            self._drive(driven, loads)
+            held = [step.motions.get(("held", *at)) for step in self.steps]
+            if (fixed := [value for value in held if value is not None]) and len(fixed) < len(held):
+                raise InputError(f"*BOUNDARY of node {at[0]}, of a *RIGID BODY: expected it in all steps, or in none")
+            motion.append(fem.Constant(self.mesh, 0.0) if fixed else None)
+            if (constant := motion[-1]) is not None:
+                self._drive(constant.value, fixed)
+        led = motion if any(one is not None for one in motion) else None
+        return RigidCoupling(self._tag(name), place[:g], force=force, moment=moment, motion=led)
 
     def _section(self, name: str, node: str, axis: list[float]) -> Preload:
         g, reference, now = self.mesh.geometry.dim, (f"node {int(node)}", 1), np.zeros(1)
@@ -367,8 +399,9 @@ def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
 
     Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
     ``*BOUNDARY``, ``*CLOAD``, pressures by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``, ``*CONTACT PAIR``, ``*TIE``,
-    ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of contact pairs and
-    ``*PRE-TENSION SECTION``, whose surface is cut; steps ``*STATIC``, ``*HEAT TRANSFER`` and
+    ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of contact pairs,
+    ``*RIGID BODY`` and ``*PRE-TENSION SECTION``, whose surface is cut; values that follow an ``*AMPLITUDE``, or are in the directions of
+    a ``*TRANSFORM``; steps ``*STATIC``, ``*HEAT TRANSFER`` and
     ``*COUPLED TEMPERATURE-DISPLACEMENT``. Cells of several kinds, prisms and pyramids are divided into simplices.
     All else is in ``left_out`` and in the log.
 

@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import Any, TypeAlias
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
-from uem_dolfinx.decks.parts import STEP_KINDS, TEMPERATURE, Interaction, Material, Model, Pair, Step, Where
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.decks.by_sets import Closing, local_axes, node_of, nodes_of
+from uem_dolfinx.decks.parts import (
+    STEP_KINDS,
+    TEMPERATURE,
+    Acting,
+    Course,
+    Interaction,
+    Linear,
+    Material,
+    Model,
+    Pair,
+    Step,
+    Value,
+    together,
+)  # fmt: skip
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.decks import Deck
 
@@ -25,13 +40,13 @@ KNOWN_OPTIONS = {
     "ELASTIC": "TYPE", "EXPANSION": "TYPE ZERO", "SOLID SECTION": "ELSET MATERIAL ORIENTATION OFFSET", "MATERIAL": "NAME",
     "SURFACE INTERACTION": "NAME", "SURFACE BEHAVIOR": "PRESSURE-OVERCLOSURE", "CONTACT PAIR": "INTERACTION TYPE ADJUST SMALL_SLIDING",
     "TIE": "NAME POSITION_TOLERANCE ADJUST", "PRE-TENSION SECTION": "SURFACE NODE", "INITIAL CONDITIONS": "TYPE",
-    "STEP": "INC NLGEOM NAME", "BOUNDARY": "OP", "CLOAD": "OP", "DLOAD": "OP", "DSLOAD": "OP", "TEMPERATURE": "OP",
+    "STEP": "INC NLGEOM NAME", "BOUNDARY": "OP AMPLITUDE", "CLOAD": "OP AMPLITUDE", "DLOAD": "OP AMPLITUDE",
+    "DSLOAD": "OP AMPLITUDE", "AMPLITUDE": "NAME TIME",
+    "RIGID BODY": "NSET ELSET REF_NODE ROT_NODE", "TRANSFORM": "NSET TYPE", "TEMPERATURE": "OP",
     "MODEL CHANGE": "TYPE ADD REMOVE", "CHANGE FRICTION": "INTERACTION", "STATIC": "SOLVER DIRECT",
     "HEAT TRANSFER": "SOLVER DIRECT STEADY_STATE",
     "COUPLED TEMPERATURE-DISPLACEMENT": "SOLVER DIRECT STEADY_STATE",
 }  # fmt: skip
-#: Values at single nodes, or sides of elements, in turn with the same of a step.
-Acting: TypeAlias = dict[tuple[Any, Any], float]
 
 
 class _Reader:
@@ -40,6 +55,8 @@ class _Reader:
     def __init__(self, deck: Deck):
         self.model, self._deck = Model(types=deck.types), deck
         self._material, self._interaction, self._begin = Material(), Interaction(), Step()
+        self._amplitudes: dict[str, Course] = {}
+        self._axes: dict[int, Array] = {}  # local directions of nodes
         self._changed = ""  # the interaction whose friction a step changes
         self._step, self._dim = self._begin, 3 if any(name.startswith("C3D") for name in deck.types) else 2
         #: Kinds of conditions of this step, and what they have set.
@@ -54,6 +71,7 @@ class _Reader:
             "PRE-TENSION SECTION": self._pretension, "INITIAL CONDITIONS": self._initial, "STEP": self._new_step,
             "BOUNDARY": self._boundary, "CLOAD": self._cload, "DLOAD": self._dload, "DSLOAD": self._dload,
             "TEMPERATURE": self._temperature, "MODEL CHANGE": self._change, "CHANGE FRICTION": self._change_friction,
+            "AMPLITUDE": self._amplitude, "RIGID BODY": self._rigid, "TRANSFORM": self._transform,
         }  # fmt: skip
 
     def take(self, keyword: str, options: dict[str, str], rows: list[list[str]]) -> bool:
@@ -149,7 +167,7 @@ class _Reader:
             terms = [left[3 * k : 3 * k + 3] for k in range(n)]
             if any(not 1 <= int(dof) <= self._dim for _, dof, _ in terms):
                 raise InputError(f"terms {terms}: expected degrees of freedom 1 to {self._dim}")
-            self.model.equations.append([(self._node(node), int(dof), float(c)) for node, dof, c in terms])
+            self.model.equations.append(Linear([(node_of(self._deck, node), (int(dof), float(c))) for node, dof, c in terms]))
             left = left[3 * n :]
 
     def _pretension(self, options: dict[str, str], rows: list[list[str]]) -> None:
@@ -158,8 +176,42 @@ class _Reader:
     def _initial(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         if options["TYPE"].upper() != "TEMPERATURE":
             return False
-        _last(self.model.initial, {self._node(row[0]): _numbers(row[1:])[0] for row in rows})
+        _last(self.model.initial, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
         return True
+
+    def _rigid(self, options: dict[str, str], rows: list[list[str]]) -> None:
+        at = int(options["REF NODE"])
+        # without a node of its own, degrees of freedom 4 to 6 are rotations
+        self.model.rigid.append(
+            (options.get("NSET") or options["ELSET"], self._deck.nodes[at], at, int(options.get("ROT NODE", "0")))
+        )
+
+    def _transform(self, options: dict[str, str], rows: list[list[str]]) -> None:
+        kind, numbers = options.get("TYPE", "R").upper(), [float(value) for row in rows for value in row if value]
+        if kind not in ("R", "C") or len(numbers) != 6:
+            raise InputError(f"TYPE={kind} with {len(numbers)} numbers: expected R or C, with two points")
+        for one in nodes_of(self._deck, options["NSET"]):
+            self._axes[one] = local_axes(kind, numbers, self._deck.nodes[one])
+
+    def _amplitude(self, options: dict[str, str], rows: list[list[str]]) -> None:
+        numbers = [float(value.lower().replace("d", "e")) for row in rows for value in row if value]
+        points = tuple(zip(numbers[::2], numbers[1::2]))
+        times = [time for time, _ in points]
+        if "USER" in options or options.get("DEFINITION", "TABULAR").upper() != "TABULAR":
+            raise InputError("an amplitude by a function: expected a table of times and amplitudes")
+        if not points or len(numbers) % 2 or sorted(set(times)) != times:
+            raise InputError(f"{len(numbers)} numbers, with the times {times}: expected pairs, and times that grow")
+        total = options.get("TIME", "").upper().startswith("TOTAL")
+        self._amplitudes[options["NAME"].upper()] = Course(1.0, points, total)
+
+    def _value(self, text: str, options: dict[str, str]) -> Value:
+        """A number of a row, which follows the amplitude in the options, if there is one."""
+        value, name = _numbers([text])[0], options.get("AMPLITUDE", "").upper()
+        if not name:
+            return value
+        if name not in self._amplitudes:
+            raise InputError(f"there is no amplitude '{name}' before it: expected one of {', '.join(self._amplitudes)}")
+        return replace(self._amplitudes[name], value=value)
 
     # -- steps -----------------------------------------------------------------------------------------------------------
 
@@ -167,23 +219,25 @@ class _Reader:
         last = self.model.steps[-1] if self.model.steps else self._begin
         self._met, self._own, self._changed = set(), set(), ""
         self._step = Step(
-            nlgeom="NLGEOM" in options and options["NLGEOM"].upper() != "NO", held=dict(last.held), forces=dict(last.forces),
-            pressures=dict(last.pressures), temperatures=dict(last.temperatures),
+            nlgeom="NLGEOM" in options and options["NLGEOM"].upper() != "NO", held=_kept(last.held, last),
+            forces=_kept(last.forces, last), pressures=_kept(last.pressures, last), temperatures=dict(last.temperatures),
         )  # fmt: skip
 
-    def _begins(self, kind: str, acting: dict[Any, float], options: dict[str, str]) -> None:
+    def _begins(self, kind: str, acting: dict[Any, Any], options: dict[str, str]) -> None:
         """Let the first keyword of a kind in a step end what acted before, with ``OP=NEW``."""
         if options.get("OP", "MOD").upper() == "NEW" and kind not in self._met:
             acting.clear()
         self._met.add(kind)
 
-    def _add(self, kind: str, acting: Acting, where: tuple[Any, Any], value: float) -> None:
-        """A load replaces that of steps before, and adds to others of its step."""
-        acting[where] = value + (acting[where] if (kind, *where) in self._own else 0.0)
+    def _add(self, kind: str, acting: Acting, where: tuple[Any, Any], value: Value) -> None:
+        """A load replaces that of steps before, and adds to others of its step, which have the same amplitude."""
+        acting[where] = together(acting[where], value, where[0]) if (kind, *where) in self._own else value
         self._own.add((kind, *where))
 
-    def _has(self, dof: int, value: float, keyword: str) -> bool:
-        """Whether bodies have a degree of freedom; rotations, and motions out of the plane, are none."""
+    def _has(self, where: str, dof: int, value: float, keyword: str) -> bool:
+        """Whether a set has a degree of freedom; rotations, and motions out of the plane, are none but of rigid bodies."""
+        if dof <= 6 and where.isdigit() and int(where) in self.model.references:
+            return True
         if dof <= self._dim or (dof == TEMPERATURE and self.model.thermal):
             if dof < 1:
                 raise InputError(f"degree of freedom {dof}: expected 1 to {self._dim}, or {TEMPERATURE}, the temperature")
@@ -200,16 +254,16 @@ class _Reader:
             where, first, last, value = [*row, "", ""][:4]
             first, last = NAMED_HOLDS.get(first.upper(), (first, last))
             for dof in range(int(first), int(last or first) + 1):
-                if self._has(dof, _numbers([value])[0], "BOUNDARY"):
+                if self._has(where, dof, _numbers([value])[0], "BOUNDARY"):
                     self._sets[where, dof] = None
-                    self._step.held |= {(one, dof): _numbers([value])[0] for one in self._nodes(where)}
+                    self._step.held |= {(one, dof): self._value(value, options) for one in nodes_of(self._deck, where)}
 
     def _cload(self, options: dict[str, str], rows: list[list[str]]) -> None:
         self._begins("CLOAD", self._step.forces, options)
         for where, dof, value in (row[:3] for row in rows):
-            if self._has(int(dof), _numbers([value])[0], "CLOAD"):
-                for one in self._nodes(where):
-                    self._add("CLOAD", self._step.forces, (one, int(dof)), _numbers([value])[0])
+            if self._has(where, int(dof), _numbers([value])[0], "CLOAD"):
+                for one in nodes_of(self._deck, where):
+                    self._add("CLOAD", self._step.forces, (one, int(dof)), self._value(value, options))
 
     def _dload(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         self._begins("DLOAD", self._step.pressures, options)
@@ -221,12 +275,12 @@ class _Reader:
             for member, side in sides:
                 own = self._deck.elsets.get(member.upper(), ("", [member]))[1] if side else [member]
                 for one in own:
-                    self._add("DLOAD", self._step.pressures, (str(one), side.upper()), _numbers([value])[0])
+                    self._add("DLOAD", self._step.pressures, (str(one), side.upper()), self._value(value, options))
         return len(pressing) == len(rows)
 
     def _temperature(self, options: dict[str, str], rows: list[list[str]]) -> None:
         self._begins("TEMPERATURE", self._step.temperatures, options)
-        _last(self._step.temperatures, {self._node(row[0]): _numbers(row[1:])[0] for row in rows})
+        _last(self._step.temperatures, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
 
     def _change(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         if options.get("TYPE", "").upper() != "CONTACT PAIR":
@@ -234,102 +288,15 @@ class _Reader:
         self._step.contacts |= {(row[0].upper(), row[1].upper()): "ADD" in options for row in rows}
         return True
 
-    def _node(self, where: str) -> str:
-        """A set as it is, and a node as the set of its own."""
-        if not where.isdigit():
-            return where
-        # reference nodes of sections belong to no body
-        return self._deck.name_node(int(where)) if int(where) in self._deck.nodes else f"node {int(where)}"
-
-    def _nodes(self, where: str) -> list[Any]:
-        """Nodes of a set or a node by their numbers, or the name of a set that there is not."""
-        found: list[Any] = [int(where)] if where.isdigit() else self._deck.nsets.get(where.upper(), ("", [where]))[1]
-        if not found:
-            raise InputError(f"the set '{where}' has no nodes: expected one node or more")
-        return found
-
-    # -- after all keywords ----------------------------------------------------------------------------------------------
-
-    def close(self) -> None:
-        """Let values at single nodes and sides be those of sets, and check that elements have materials."""
-        steps, deck = self.model.steps, self._deck
-        for elements, name in self.model.sections:
-            if name not in self.model.materials:
-                raise InputError(
-                    f"there is no material '{name}': expected one of {', '.join(self.model.materials) or 'the deck'}"
-                )
-            if elements not in deck.elsets:
-                raise InputError(f"there is no set of elements '{elements}', which a *SOLID SECTION holds")
-        count = Counter(one for elements, _ in self.model.sections for one in set(deck.elsets[elements][1]))
-        if twice := [one for one, n in count.items() if n > 1]:
-            raise InputError(f"element {min(twice)} has two sections: expected one")
-        bodies = all(name.startswith(("C3D", "CP", "CAX")) for name in self.model.types)
-        if bodies and (bare := set(deck.elements).difference(count)):
-            raise InputError(f"element {min(bare)} has no *SOLID SECTION: expected a material of all elements")
-        held, forces, pressures = ([getattr(step, what) for step in steps] for what in ("held", "forces", "pressures"))
-        for step in steps:
-            step.held, step.forces, step.pressures = {}, {}, {}
-        for (where, dof), history in self._in_sets(held):
-            self._give("held", (self._named("held", where), dof), history)
-        by_node: dict[Any, dict[int, list[float | None]]] = {}
-        for (one, dof), history in _histories(forces).items():
-            by_node.setdefault(one, {})[dof] = history
-        for nodes in _alike(by_node):
-            name = self._named("loaded", nodes)
-            for dof, history in by_node[nodes[0]].items():
-                self._give("forces", (name, dof), history)
-        of_sides = _histories(pressures)
-        for group in _alike(of_sides):
-            name = group[0][0] if not group[0][1] else f"pressed {len(deck.surfaces)}"
-            if group[0][1]:
-                deck.surfaces[name] = (True, [list(side) for side in group])
-            self._give("pressures", (name, "P"), of_sides[group[0]])
-
-    def _give(self, what: str, where: Where, history: list[float | None]) -> None:
-        for step, value in zip(self.model.steps, history):
-            if value is not None:
-                getattr(step, what)[where] = value
-
-    def _in_sets(self, held: list[Acting]) -> Iterator[tuple[tuple[Any, int], list[float | None]]]:
-        """Sets of the file that have one history each, and what is left, in sets of nodes with the same history."""
-        left = by_node = _histories(held)
-        for where, dof in self._sets:
-            nodes = self._nodes(where)
-            # reference nodes of sections are no nodes of a body
-            if all(by_node.get((one, dof)) == by_node.get((nodes[0], dof)) is not None for one in nodes):
-                yield (where if not where.isdigit() else [int(where)], dof), by_node[nodes[0], dof]
-                left = {at: history for at, history in left.items() if at[1] != dof or at[0] not in set(nodes)}
-        for dof in dict.fromkeys(dof for _, dof in left):
-            of_dof = {one: history for (one, other), history in left.items() if other == dof}
-            for nodes in _alike(of_dof):
-                yield (nodes, dof), of_dof[nodes[0]]
-
-    def _named(self, what: str, nodes: Any) -> str:
-        """The name of a set of these nodes, which is made if there is none."""
-        if isinstance(nodes, str) or isinstance(nodes[0], str):
-            return nodes if isinstance(nodes, str) else nodes[0]
-        if len(nodes) == 1:
-            return self._node(str(nodes[0]))
-        name = f"{what} {len(self._deck.nsets)}"
-        self._deck.nsets[name.upper()] = (name, nodes)
-        if what == "loaded":
-            # a set may be a surface, and these are forces at its nodes
-            self._deck.loaded.add(name)
-        return name
+    def closing(self) -> Closing:
+        """What is left to be done after all keywords."""
+        return Closing(self._deck, self.model, self._sets, self._axes)
 
 
-def _histories(acting: list[Acting]) -> dict[Any, list[float | None]]:
-    """Values in all steps, by their places; None where there is none."""
-    return {at: [one.get(at) for one in acting] for at in dict.fromkeys(at for one in acting for at in one)}
-
-
-def _alike(histories: dict[Any, Any]) -> list[list[Any]]:
-    """Places with the same values; a name has a list of its own."""
-    found: dict[str, list[Any]] = {}
-    for at, history in histories.items():
-        named = isinstance(at, str) or (isinstance(at, tuple) and not at[1])
-        found.setdefault(f"{at if named else ''} {history}", []).append(at)
-    return list(found.values())
+def _kept(acting: Acting, last: Step) -> Acting:
+    """What acts on from a step: values that followed its time stay as they were at its end."""
+    followed = {w: v.at(last.duration, 0.0) for w, v in acting.items() if isinstance(v, Course) and not v.total}
+    return acting | followed
 
 
 def _last(values: dict[str, float], more: dict[str, float]) -> None:
@@ -364,15 +331,14 @@ def model_of(deck: Deck) -> Model:
             left_out.append(f"*{keyword}")
             continue
         unknown = [name for name in options if name and name.replace(" ", "_") not in KNOWN_OPTIONS.get(keyword, "").split()]
-        grow = ": values grow in proportion to the time of the step"
-        left_out += [f"{name} of *{keyword}{grow if name == 'AMPLITUDE' else ''}" for name in unknown]
+        left_out += [f"{name} of *{keyword}" for name in unknown]
     left_out += [f"{n} elements of type {name}: they are no part of a body" for name, n in deck.left_out.items()]
     left_out += [f"{name}: complete cells, integrated fully" for name in sorted(deck.types) if re.search(OTHERWISE, name)]
     if reader.model.thickness != 1.0:
         left_out.append(f"thickness {reader.model.thickness}: forces of contacts and sections are those of a thickness of 1")
     if not reader.model.steps:
         raise InputError(f"the deck has no step that can be taken: expected *STEP with one of {', '.join(STEP_KINDS)}")
-    reader.close()
+    reader.closing().close()
     left_out[:] = dict.fromkeys(left_out)
     return reader.model
 

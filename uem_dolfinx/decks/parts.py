@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
+
+import numpy as np
+
+from uem_dolfinx.errors import InputError
 
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
 STEP_KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True}
@@ -13,6 +17,50 @@ TEMPERATURE = 11
 
 #: A set or a node, by name, and a degree of freedom, or the label of a load.
 Where: TypeAlias = tuple[str, Any]
+
+
+@dataclass(frozen=True)
+class Course:
+    """A value that follows an amplitude: linear between its points, constant beyond them.
+
+    Attributes:
+        value: at the amplitude 1.
+        points: times and amplitudes.
+        total: whether times are those since the start of the first step, not of its own.
+    """
+
+    value: float
+    points: tuple[tuple[float, float], ...]
+    total: bool = False
+
+    def at(self, time: float, total: float) -> float:
+        """The value at a time of the step and in all."""
+        return self.value * float(np.interp(total if self.total else time, *np.transpose(self.points)))
+
+    def __truediv__(self, divisor: float) -> Course:
+        """The value divided by a number."""
+        return replace(self, value=self.value / divisor)
+
+    def __mul__(self, factor: float) -> Course:
+        """The value times a number."""
+        return replace(self, value=self.value * factor)
+
+
+#: A value at the end of a step, to which it grows in proportion to time, or one that follows an amplitude.
+Value: TypeAlias = float | Course
+#: Values at single nodes, or sides of elements, in turn with the same of a step.
+Acting: TypeAlias = dict[tuple[Any, Any], Value]
+
+
+def together(one: Value, other: Value, where: Any) -> Value:
+    """The sum of two values at a place; InputError for two amplitudes."""
+    if not isinstance(one, Course) and not isinstance(other, Course):
+        return one + other
+    if one == 0.0 or other == 0.0:
+        return other if one == 0.0 else one
+    if isinstance(one, Course) and isinstance(other, Course) and replace(one, value=other.value) == other:
+        return replace(one, value=one.value + other.value)
+    raise InputError(f"loads of two amplitudes act at {where}: expected one")
 
 
 @dataclass
@@ -50,11 +98,20 @@ class Pair:
 
 
 @dataclass
+class Linear:
+    """A linear equation: sets or nodes with degree of freedom and coefficient, or with vectors, and values in all steps if any."""
+
+    terms: list[tuple[str, Any]]
+    values: list[Value] = field(default_factory=list)
+
+
+@dataclass
 class Step:
     """A step: its kind, times, and all conditions and loads that act in it, with their values at its end.
 
     Attributes:
         friction: coefficients that change, by the names of interactions.
+        motions: values of ``held`` and ``forces`` at reference nodes of rigid bodies, by these words, node and degree of freedom.
     """
 
     kind: str = "STATIC"
@@ -63,12 +120,13 @@ class Step:
     duration: float = 1.0
     steady: bool = False
     direct: bool = False
-    held: dict[Where, float] = field(default_factory=dict)
-    forces: dict[Where, float] = field(default_factory=dict)
-    pressures: dict[Where, float] = field(default_factory=dict)
+    held: dict[Where, Value] = field(default_factory=dict)
+    forces: dict[Where, Value] = field(default_factory=dict)
+    pressures: dict[Where, Value] = field(default_factory=dict)
     temperatures: dict[str, float] = field(default_factory=dict)
     contacts: dict[tuple[str, str], bool] = field(default_factory=dict)
     friction: dict[str, float] = field(default_factory=dict)
+    motions: dict[tuple[str, int, int], Value] = field(default_factory=dict)
 
 
 @dataclass
@@ -78,8 +136,9 @@ class Model:
     Attributes:
         sections: set of elements and material of each section.
         thickness: of plane bodies.
-        equations: lists of node, degree of freedom and coefficient.
+        equations: linear equations among nodes.
         initial: temperatures at the start, by set or node.
+        rigid: set, position, and nodes of translation and rotation of each rigid body.
         pretension: surface, reference node and axis of each section of a bolt.
         left_out: what has no counterpart here, or is read otherwise than it stands.
     """
@@ -90,11 +149,17 @@ class Model:
     sections: list[tuple[str, str]] = field(default_factory=list)
     thickness: float = 1.0
     pairs: list[Pair] = field(default_factory=list)
-    equations: list[list[tuple[str, int, float]]] = field(default_factory=list)
+    equations: list[Linear] = field(default_factory=list)
     initial: dict[str, float] = field(default_factory=dict)
+    rigid: list[tuple[str, list[float], int, int]] = field(default_factory=list)
     pretension: list[tuple[str, str, list[float]]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+
+    @property
+    def references(self) -> set[int]:
+        """Reference nodes of rigid bodies."""
+        return {node for _, _, *nodes in self.rigid for node in nodes}
 
     @property
     def thermal(self) -> bool:
