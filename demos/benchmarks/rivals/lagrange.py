@@ -18,6 +18,7 @@ from scipy.sparse import coo_matrix
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.log import timed
+from uem_dolfinx.solve.bodies.far_apart import FarApart
 from uem_dolfinx.solve.rigid.floating import FloatingBodies
 from uem_dolfinx.solve.united.newton import Increment, LinearisedProblem
 from uem_dolfinx.solve.united.system import BodySystem
@@ -49,7 +50,7 @@ class LagrangeSystem(BodySystem):
     def __init__(self, bodies: Bodies, pairs: list[Interface], solver: UnitedSolver, **options: Any):
         super().__init__(bodies, pairs, solver, **options)
         # nothing holds what floats
-        self.floating = FloatingBodies(bodies, [])
+        self.floating = FloatingBodies(bodies, [], None, FarApart(bodies.config, []))
         #: The saddle-point matrix of the last solve.
         self.saddle: PETSc.Mat | None = None
         self._made_of: object = None

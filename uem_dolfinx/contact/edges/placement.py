@@ -6,6 +6,7 @@ With weights ``N_a`` of the nodes of the contactor's edge and ``M_b`` of the opp
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,8 +16,8 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
-from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import ContactRows, GapRows, Traction
+from uem_dolfinx.contact.seam.ends import Ends, slide_off
+from uem_dolfinx.contact.seam.placement import Along, ContactRows, GapRows, Traction
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
@@ -91,10 +92,10 @@ class EdgeKinematics(PlacedOnTarget):
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
-    def follow(self, state: PairState) -> tuple[EdgeKinematics, PairState, bool]:
+    def follow(self, state: PairState, off: Bools) -> tuple[EdgeKinematics, PairState]:
         """Note the facets of the crossings that hold contactors; their equations change smoothly."""
-        facet = np.where(state.active, self.projection.facet, state.facet)
-        return self, replace(state, facet=facet), False
+        state = slide_off(state, off)
+        return self, replace(state, facet=np.where(state.active, self.projection.facet, state.facet))
 
     # -- deciding quantities ---------------------------------------------------------------------------------------------
 
@@ -118,29 +119,27 @@ class EdgeKinematics(PlacedOnTarget):
         )
         return GapRows.along_normals(of.config, equations, self.share, of.free)
 
-    def forces(self, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
+    def forces(
+        self, state: PairState, rows: ContactRows, multipliers: Array, friction: Callable[[Array], Array] | None = None
+    ) -> Traction:
         """Forces at the crossings."""
         lam = np.zeros(len(self.points))
         lam[rows.contactor[rows.normal]] = multipliers[rows.normal]
         lam = lam / self.share
-        return Traction(lam, lam, lam[:, None] * self.projection.normal)
+        found = Traction(lam, lam, lam[:, None] * self.projection.normal)
+        return found if friction is None else found.with_friction(tau := friction(lam), self.ties, tau / self.share[:, None])
 
-    def nodal_friction(self, tau: Array) -> Array:
-        """Friction at the crossings."""
-        return np.asarray(tau / self.share[:, None])
-
-    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """Second derivatives of the gaps of contactors with force."""
+    def curvature(self, state: PairState, along: Along | None = None) -> list[tuple[Ints, Array]]:
+        """Second derivatives of the gaps of contactors with force; friction at a crossing moves along both edges, and turns."""
         lam = state.lam[self.which]
         k = np.flatnonzero(((lam > 0) | ~state.active[self.which]) & (lam != 0))
-        return [(self._nodes[k], -lam[k, None, None] * self.gaps.take(k).hessians())]
-
-    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
-        """Derivatives of friction at the nodes of both edges: the crossing moves along these, and its plane turns."""
-        place = np.searchsorted(self.which, which)
-        known = np.append(self.which, -1)[place] == which
-        k = place[known]
-        return [(self._nodes[k], self.gaps.take(k).turnings(tau[known] / self.share[which[known], None]))]
+        parts = [(self._nodes[k], -lam[k, None, None] * self.gaps.take(k).hessians())]
+        if along is None:
+            return parts
+        place = np.searchsorted(self.which, along.which)
+        known = np.append(self.which, -1)[place] == along.which
+        k, tau = place[known], along.tau[known] / self.share[along.which[known], None]
+        return [*parts, (self._nodes[k], -self.gaps.take(k).turnings(tau))]
 
     @property
     def _nodes(self) -> Ints:

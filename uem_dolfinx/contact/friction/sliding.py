@@ -21,7 +21,7 @@ from uem_dolfinx.contact.friction.rows import with_friction
 from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING, Violations
 from uem_dolfinx.contact.seam.corners import friction_in
-from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics, Traction
+from uem_dolfinx.contact.seam.placement import Along, ContactRows, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -312,17 +312,19 @@ class Sliding:
         self, equations: ContactRows, multipliers: Array, state: PairState, kinematics: Kinematics, du: Array | None
     ) -> Traction:
         """Normal and tangential forces from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
-        across = kinematics.forces(state, equations, multipliers)
-        share, i = kinematics.ties.share, np.flatnonzero(equations.tangent >= 0)
-        limit = self._limit(state, across.lam) / share
-        tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
-        np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.rows.direction[i])
-        if du is not None and self._follows_slip:
-            sideways, part, stiffness = self.turning(state, kinematics)
-            i = np.flatnonzero(self.slipping(state))
-            taken = np.einsum("kgh,kh->kg", stiffness, self.frame.way.relative(du)[i])
-            tau[i] -= taken + part[:, None] * np.einsum("kgh,kh->kg", sideways, self.pivot.tau[i])
-        return across._replace(force=across.force + kinematics.nodal_friction(tau), tau=tau * share[:, None])
+
+        def friction(lam: Array) -> Array:
+            limit, i = self._limit(state, lam) / kinematics.ties.share, np.flatnonzero(equations.tangent >= 0)
+            tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
+            np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.rows.direction[i])
+            if du is not None and self._follows_slip:
+                sideways, part, stiffness = self.turning(state, kinematics)
+                i = np.flatnonzero(self.slipping(state))
+                taken = np.einsum("kgh,kh->kg", stiffness, self.frame.way.relative(du)[i])
+                tau[i] -= taken + part[:, None] * np.einsum("kgh,kh->kg", sideways, self.pivot.tau[i])
+            return tau
+
+        return kinematics.forces(state, equations, multipliers, friction)
 
     def has_known_forces(self, state: PairState) -> bool:
         """Whether friction of any contactor of this rank may be independent of the normal force."""
@@ -370,19 +372,18 @@ class Sliding:
         forces = np.einsum("k,ka,kgh,kh->kag", part, share, sideways, self.pivot.tau[i]).reshape(k, m * g)
         return nodes, blocks, forces
 
-    def curvature(self, state: PairState, kinematics: Kinematics) -> list[tuple[Ints, Array]]:
-        """Derivatives of the tangential rows times friction forces (collective).
+    def along(self, state: PairState, kinematics: Kinematics) -> Along | None:
+        """Friction whose tangential rows turn; None if no rank has any (collective).
 
-        For contactors that stick at points they vanish, since all components follow the same point.
+        Rows of contactors that stick at points do not, since all components follow the same point.
         """
         slips = self.slipping(state) & (state.lam > 0)
         held = self.active(state) & _of(state).stick & (not self.discretisation.traits.at_feet)
         which = np.flatnonzero(slips | held)
         if not reduced(self.config.comm, len(which)):
-            return []
+            return None
         force = np.where(slips[:, None], -self._limit(state, state.lam)[:, None] * self.directions(state), _of(state).tau)
-        tau = (force / kinematics.ties.share[:, None])[which]
-        return [(nodes, -blocks) for nodes, blocks in kinematics.turning(state, which, tau, held[which])]
+        return Along(which, (force / kinematics.ties.share[:, None])[which], held[which])
 
     # -- from step to step -----------------------------------------------------------------------------------------------
 

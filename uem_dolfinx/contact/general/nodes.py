@@ -42,10 +42,6 @@ class AmongBodies(NodeToSurface):
         super().begin_step()
         self.target.neighbours.begin_step()
 
-    def look_farther(self) -> bool:
-        """Extend the reach by a factor of 4; False if it already exceeds the size of the model."""
-        return self.target.number == 0 and self.target.neighbours.look_farther()
-
     def commit(self) -> None:
         """Accept a step: current positions decide which side of facets nodes are on."""
         super().commit()

@@ -15,8 +15,8 @@ from uem_dolfinx.contact.mortar.ends import curvature
 from uem_dolfinx.contact.mortar.rows import Elimination, Remembered, Terms, WeightedRows, terms_of
 from uem_dolfinx.contact.mortar.turning import Frictional, turning
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
-from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import GapRows
+from uem_dolfinx.contact.seam.ends import Ends, slide_off
+from uem_dolfinx.contact.seam.placement import Along, GapRows
 from uem_dolfinx.contact.seam.pressure_map import PressureMap, Stretch
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
@@ -127,13 +127,13 @@ class MortarKinematics(PlacedOnTarget):
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
-    def follow(self, state: PairState) -> tuple[MortarKinematics, PairState, bool]:
-        """Count changes of facet by uncovered contactors, until they get averaged normals; equations do not change here.
+    def follow(self, state: PairState, off: Bools) -> tuple[MortarKinematics, PairState]:
+        """Release contactors; count changes of facet by uncovered ones, until they get averaged normals. Equations do not change here.
 
         The state stores facets covered by a rigid target, or nodes with a dual function of their own on a mesh. Facets that face
         each other are stored until the end of the step.
         """
-        of, rows = self.of, self.rows
+        of, rows, state = self.of, self.rows, slide_off(state, off)
         if of.sliding == "finite":
             covered = np.zeros(of.surface.dofs.shape, dtype=bool)
             if isinstance(of.target, MeshTarget):
@@ -144,10 +144,10 @@ class MortarKinematics(PlacedOnTarget):
                 covered[rows.facets[rows.points.facet[rows.points.segments.pair]]] = True
             state = replace(state, cover=of.remembered.of(covered))
         if not (of.target.faceted and of.sliding == "finite"):
-            return self, state, False
+            return self, state
         number = self.projection.facet
         moved = state.active & ~rows.covered & (state.facet >= 0) & (state.facet != number)
-        return self, replace(state, facet=number, changes=state.changes + moved), False
+        return self, replace(state, facet=number, changes=state.changes + moved)
 
     # -- deciding quantities ---------------------------------------------------------------------------------------------
 
@@ -165,22 +165,23 @@ class MortarKinematics(PlacedOnTarget):
         """One row for each contactor, divided by the length of the weighted gap's derivative."""
         return GapRows.along_normals(self.of.config, self.rows.equations, self.rows.length, self.of.free)
 
-    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """Second derivatives of the weighted gaps."""
+    def curvature(self, state: PairState, along: Along | None = None) -> list[tuple[Ints, Array]]:
+        """Second derivatives of the weighted gaps.
+
+        Friction of covered contactors turns, scales with the traction, and is handed to other nodes opposite (collective).
+        """
         of, rows = self.of, self.rows
         pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)
         dofs = of.surface.dofs[rows.facets]
         at_nodes = of.config.from_owners(of.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
-        return curvature(rows.points, at_nodes)
-
-    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
-        """For covered contactors: rotation and scaling of the traction, and its transmission to opposite nodes (collective)."""
-        of, rows = self.of, self.rows
+        parts = curvature(rows.points, at_nodes)
+        if along is None:
+            return parts
         assert rows.weights is not None
-        kept = rows.covered[which]
-        slips = np.ones(len(which), dtype=bool) if held is None else ~held
-        frictional = Frictional(which[kept], self.normal[which[kept]], tau[kept], slips[kept])
-        return turning(of.elimination, rows, of.surface.dofs[rows.facets], frictional, rows.weights)
+        kept = rows.covered[along.which]
+        which = along.which[kept]
+        frictional = Frictional(which, self.normal[which], along.tau[kept], ~along.held[kept])
+        return parts + [(nodes, -blocks) for nodes, blocks in turning(of.elimination, rows, dofs, frictional, rows.weights)]
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Multipliers are current pressures with finite sliding, and forces over kept areas with small and fixed sliding (collective)."""

@@ -157,7 +157,7 @@ class Bernstein(NodeToSurface):
         k, gap = kinematics, kinematics.projection.gap
         usable = ~k.ends.past(state) & ~state.in_corner
         control = self.family.control_gaps(k.projection, usable)
-        plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.left, k.out)
+        plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.out)
         return ControlKinematics(*plain, control=control)
 
 
@@ -194,7 +194,7 @@ class ControlKinematics(NodalKinematics):
     def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
         return self.control.forces(multipliers, state.active)
 
-    def nodal_friction(self, tau: Array) -> Array:
+    def _nodal_friction(self, tau: Array) -> Array:
         """Friction at the nodes from friction at the control points, without reactions on targets that are contactors (collective)."""
         sums = self.control.family.sums(self.control.shared)
         return np.column_stack([along - sums.of(along) for along in tau.T])

@@ -18,8 +18,8 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
-from uem_dolfinx.contact.seam.ends import Ends
-from uem_dolfinx.contact.seam.placement import ContactRows, GapRows, Traction, Traits
+from uem_dolfinx.contact.seam.ends import Ends, slide_off
+from uem_dolfinx.contact.seam.placement import Along, ContactRows, GapRows, Traction, Traits
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
@@ -150,14 +150,12 @@ class NodalKinematics(PlacedOnTarget):
     Attributes:
         corners: of the target that hold contactors; None if no rank has such a corner.
         target_moves: whether the target can move along the normal ``(n,)``; None if no contactor is prescribed.
-        left: contactors that have just left a corner ``(n,)``, or None.
         out: contactors that are left to other equations ``(n,)``, or None.
     """
 
     of: NodeToSurface
     corners: Corners | None
     target_moves: Bools | None
-    left: Bools | None = None
     out: Bools | None = None
 
     @cached_property
@@ -201,24 +199,18 @@ class NodalKinematics(PlacedOnTarget):
 
     # -- the same contactors in another state ----------------------------------------------------------------------------
 
-    def placed_again(self, state: PairState) -> NodalKinematics:
-        """Place contactors that have entered or left a corner (collective)."""
-        edges = self.of.concave_edges
+    def follow(self, state: PairState, off: Bools) -> tuple[NodalKinematics, PairState]:
+        """Release contactors, follow others across edges, and place those that enter or leave a corner (collective)."""
+        edges, moved, state = self.of.concave_edges, bool((state.active & off).any()), slide_off(state, off)
         if edges is None:
-            return self
-        left = np.zeros(len(self.points), dtype=bool) if self.left is None else self.left
-        nearest, projection, corners = edges.place_again(self.nearest, left, self.points, state)
-        there = replace(self, projection=projection, nearest=nearest, gap=projection.gap, corners=corners)
-        return self.of.measured(there, state)
-
-    def follow(self, state: PairState) -> tuple[NodalKinematics, PairState, bool]:
-        """Follow contactors across edges, into and out of corners (collective)."""
-        edges = self.of.concave_edges
-        if edges is None:
-            return self, state, False
+            return self, state
         state, left = edges.leave(self.corners, state)
         state, entered = edges.follow(self.nearest, left, self.points, state)
-        return replace(self, left=left), state, bool(left.any()) or entered
+        if not reduced(self.of.config.comm, moved or bool(left.any()) or entered, op=MPI.LOR):
+            return self, state
+        nearest, projection, corners = edges.place_again(self.nearest, left, self.points, state)
+        there = replace(self, projection=projection, nearest=nearest, gap=projection.gap, corners=corners)
+        return self.of.measured(there, state), state
 
     # -- deciding quantities ---------------------------------------------------------------------------------------------
 
@@ -261,8 +253,10 @@ class NodalKinematics(PlacedOnTarget):
         p, none = self.projection, np.zeros(len(self.points), bool)
         return UnitingEquations.along(self.of.nodes, p.normal, p.nodes, weights, self.gap, none)
 
-    def forces(self, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
-        """Normal contact forces, summed over the facets of a corner (collective)."""
+    def forces(
+        self, state: PairState, rows: ContactRows, multipliers: Array, friction: Callable[[Array], Array] | None = None
+    ) -> Traction:
+        """Contact forces, normal ones summed over the facets of a corner (collective)."""
         lam = np.zeros(len(self.points))
         lam[rows.contactor[rows.normal]] = multipliers[rows.normal]
         (lam, nodal), c = self._nodal(state, lam), self.corners
@@ -273,14 +267,15 @@ class NodalKinematics(PlacedOnTarget):
         lam = lam * self.cone
         if c is not None:
             lam[c.which] = np.einsum("kg,kg->k", force[c.which], c.summing)
-        return Traction(lam, nodal, force)
+        found = Traction(lam, nodal, force)
+        return found if friction is None else found.with_friction(tau := friction(lam), self.ties, self._nodal_friction(tau))
 
     def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
         """Deciding and nodal normal forces from the multipliers of all contactors, each ``(n,)`` (collective)."""
         return multipliers, multipliers
 
-    def nodal_friction(self, tau: Array) -> Array:
-        """Nodal friction equals the multipliers."""
+    def _nodal_friction(self, tau: Array) -> Array:
+        """Forces at the contactors from multipliers of tangential rows, both ``(n, gdim)`` (collective)."""
         return tau
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
@@ -290,8 +285,8 @@ class NodalKinematics(PlacedOnTarget):
         share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
         return nodes.ravel(), (share[..., None] * state.force[i, None, :]).reshape(-1, config.gdim)
 
-    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """Second derivatives of the gaps of contactors with force; contactors in corners remain on the edge."""
+    def curvature(self, state: PairState, along: Along | None = None) -> list[tuple[Ints, Array]]:
+        """Derivatives of the rows of contactors with force; contactors in corners remain on the edge, and their friction does not turn."""
         p, c, nodes = self.projection, self.corners, self.of.nodes
         i = np.flatnonzero(((state.lam > 0) | ~state.active) & (state.nodal != 0) & ~state.in_corner)
         own, followed, blocks = nodes[i], p.nodes[i], -state.nodal[i, None, None] * p.hessians(i)
@@ -299,13 +294,13 @@ class NodalKinematics(PlacedOnTarget):
             own = np.concatenate([own, nodes[c.which]])
             followed = np.concatenate([followed, c.nodes])
             blocks = np.concatenate([blocks, -c.hessians(state.force[c.which])])
-        return [(np.column_stack([self.of.config.to_global(own), followed]), blocks)]
-
-    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
-        """Derivatives of the rows along friction forces, without contactors held in corners."""
-        plain = ~state.in_corner[which]
-        i, p = which[plain], self.projection
-        return [(np.column_stack([self.of.config.to_global(self.of.nodes[i]), p.nodes[i]]), p.turnings(i, tau[plain]))]
+        parts = [(np.column_stack([self.of.config.to_global(own), followed]), blocks)]
+        if along is None:
+            return parts
+        plain = ~state.in_corner[along.which]
+        i = along.which[plain]
+        turned = np.column_stack([self.of.config.to_global(nodes[i]), p.nodes[i]])
+        return [*parts, (turned, -p.turnings(i, along.tau[plain]))]
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Map of nodal forces, which are integrals of the pressure times the node's shape function."""

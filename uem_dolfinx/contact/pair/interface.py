@@ -17,7 +17,6 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.pair.readings import Readings
 from uem_dolfinx.contact.seam import active_set
-from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.errors import NotFiniteError
@@ -122,14 +121,6 @@ class Interface(Readings):
             assert self.trial.friction is not None
             self.friction.place(self.kinematics, self.trial.friction)
 
-    def _replace(self, kinematics: Kinematics) -> None:
-        """Replace the kinematics at the same displacement (collective)."""
-        # objects are identical on all ranks or on none
-        if kinematics is not self.kinematics:
-            self.kinematics = kinematics
-            if self.friction is not None:
-                self.friction.replace(kinematics)
-
     def look(self) -> None:
         """Project contactors that were skipped because the surfaces are separated (collective)."""
         if self.far:
@@ -188,10 +179,13 @@ class Interface(Readings):
 
     def follow(self) -> bool:
         """Release contactors past an end, follow the others from facet to facet (collective): whether an equation changes on this rank."""
-        off = self.off
+        off, before = self.off, self.kinematics
         gone = bool((self.trial.active & off).any())
-        self.kinematics, state, moved = self.kinematics.follow(slide_off(self.trial, off))
+        self.kinematics, state = before.follow(self.trial, off)
         self._set_active(state)
+        moved = self.kinematics is not before
+        if moved and self.friction is not None:
+            self.friction.replace(self.kinematics)
         return gone or moved
 
     def violated(
@@ -256,10 +250,6 @@ class Interface(Readings):
         """Take the normals of other contacts with rigid surfaces at the same contactors ``(n, k, gdim)`` (collective)."""
         if self.friction is not None:
             self.friction.meet(self.kinematics, normals)
-
-    def place_again(self) -> None:
-        """Place contactors again if their equations have changed (collective)."""
-        self._replace(self.kinematics.placed_again(self.trial))
 
     # -- bodies that only contact holds ----------------------------------------------------------------------------------
 
@@ -347,9 +337,8 @@ class Interface(Readings):
 
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
-        parts = self.kinematics.curvature(self.trial)
-        if self.friction is not None:
-            parts = parts + self.friction.curvature(self.trial, self.kinematics)
+        along = None if self.friction is None else self.friction.along(self.trial, self.kinematics)
+        parts = self.kinematics.curvature(self.trial, along)
         return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
     def turn(self, stiffness: Array) -> None:

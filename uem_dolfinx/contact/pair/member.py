@@ -109,8 +109,8 @@ class Member(Interface):
             return of.nowhere(points)
         nearest = self._alone(whole.nearest)
         projection = nearest if whole.projection is whole.nearest else self._alone(whole.projection)
-        moves, left = (None if a is None else a[some] for a in (whole.target_moves, whole.left))
-        return NodalKinematics(of, points, projection, nearest, whole.gap[some], self._corners_of(whole.corners), moves, left)
+        moves = None if whole.target_moves is None else whole.target_moves[some]
+        return NodalKinematics(of, points, projection, nearest, whole.gap[some], self._corners_of(whole.corners), moves)
 
     def _alone(self, p: Any) -> Any:
         nodal = self.joined.discretisation

@@ -37,7 +37,6 @@ from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Violations
 from uem_dolfinx.contact.seam.dyads import grouped
-from uem_dolfinx.contact.seam.ends import slide_off
 from uem_dolfinx.contact.seam.placement import ContactRows, Traction
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.parallel import reduced
@@ -293,7 +292,7 @@ class SoftInterface(Interface):
         """Release contactors past an end (collective); see ``Interface``."""
         pressing = replace(self.trial, active=self.united)
         gone = bool((pressing.active & self.off).any())
-        self.kinematics, state, _ = self.kinematics.follow(slide_off(pressing, self.off))
+        self.kinematics, state = self.kinematics.follow(pressing, self.off)
         self.trial = replace(state, active=self.trial.active)
         return gone
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.contact.seam.ends import Ends
+from uem_dolfinx.contact.seam.ends import Ends, slide_off
 from uem_dolfinx.contact.seam.placement import ContactRows, Kinematics, Setting, Traction, Traits
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
@@ -138,13 +139,6 @@ class OnTarget:
         if self._renewing:
             self.let_go()
 
-    def look_farther(self) -> bool:
-        """Include separated surfaces from the next placement on; return whether they were separated."""
-        far = self.setting.far
-        if far.any():
-            self.set(far=np.zeros_like(far))
-        return bool(far.any())
-
     def let_go(self) -> None:
         """Drop the kept closest points; the next placement finds new ones."""
         self.anchor, self._renewing = None, False
@@ -180,13 +174,9 @@ class PlacedOnTarget:
         """Of the projection ``(n, gdim)``."""
         return self.projection.normal
 
-    def placed_again(self: Kinematics, state: PairState) -> Kinematics:
-        """Unchanged, since no equation depends on the state."""
-        return self
-
-    def follow(self: Kinematics, state: PairState) -> tuple[Kinematics, PairState, bool]:
-        """Unchanged, since equations do not depend on a single facet."""
-        return self, state, False
+    def follow(self: Kinematics, state: PairState, off: Bools) -> tuple[Kinematics, PairState]:
+        """Release contactors; equations do not depend on a single facet."""
+        return self, slide_off(state, off)
 
     @cached_property
     def ends(self) -> Ends:
@@ -197,18 +187,24 @@ class PlacedOnTarget:
         """Those of the projection."""
         return self.projection.height
 
-    def forces(self: Kinematics, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
-        """Forces of the rows at both bodies, where contactors follow each other too (collective)."""
+    def forces(
+        self: Kinematics,
+        state: PairState,
+        rows: ContactRows,
+        multipliers: Array,
+        friction: Callable[[Array], Array] | None = None,
+    ) -> Traction:
+        """Forces of the rows, and friction by the weights, at both bodies, where contactors follow each other too (collective)."""
         of, mu = self.gap_rows, np.zeros(len(self.gap))
         mu[rows.contactor[rows.normal]] = multipliers[rows.normal]
         force = np.asarray(of.config.add_at_owners(*of.forces(mu))[of.equations.node])
         lam = mu * self.pressure_map(False).force
-        return Traction(lam, np.einsum("ng,ng->n", force, self.projection.normal), force)
-
-    def nodal_friction(self: Kinematics, tau: Array) -> Array:
-        """Friction forces by the weights, including contactors that follow each other (collective)."""
-        rows = self.gap_rows
-        return np.asarray(rows.config.add_at_owners(*self.ties.handed_on(tau))[rows.equations.node])
+        found = Traction(lam, np.einsum("ng,ng->n", force, self.projection.normal), force)
+        if friction is None:
+            return found
+        return found.with_friction(
+            tau := friction(lam), self.ties, of.config.add_at_owners(*self.ties.handed_on(tau))[of.equations.node]
+        )
 
     def nodal_forces(self: Kinematics, state: PairState) -> tuple[Ints, Array]:
         """Nodal forces of the state's multipliers by the rows, and of friction by the weights."""

@@ -7,7 +7,7 @@ and forces only, not on rows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -51,6 +51,10 @@ class Traction(NamedTuple):
     tau: Array | None = None
     bond: Array | None = None
     heat: Array | None = None
+
+    def with_friction(self, tau: Array, ties: Ties, force: Array) -> Traction:
+        """With multipliers ``tau`` of tangential rows, and the ``force`` that they exert on contactors, each ``(n, gdim)``."""
+        return self._replace(force=self.force + force, tau=tau * ties.share[:, None])
 
 
 @dataclass(frozen=True)
@@ -236,6 +240,20 @@ class GapRows:
         return found
 
 
+class Along(NamedTuple):
+    """Friction forces whose derivatives are part of the curvature.
+
+    Attributes:
+        which: contactors, ascending; with ``at_feet`` only slipping ones ``(k,)``.
+        tau: their friction, as multipliers of tangential rows ``(k, gdim)``.
+        held: sticking contactors, with constant multipliers instead of a constant coefficient of friction ``(k,)``.
+    """
+
+    which: Ints
+    tau: Array
+    held: Bools
+
+
 class Kinematics(Protocol):
     """Position of contactors relative to their target, in one state and at one displacement; immutable."""
 
@@ -267,49 +285,45 @@ class Kinematics(Protocol):
     def ties(self) -> Ties:
         """Weights by which contactors follow other nodes, and their relative motion (first time: collective)."""
 
-    # -- the same contactors in another state ----------------------------------------------------------------------------
+    def follow(self, state: PairState, off: Bools) -> tuple[Kinematics, PairState]:
+        """Release contactors ``off (n,)`` the target, follow others from facet to facet, into and out of corners (collective).
 
-    def placed_again(self, state: PairState) -> Kinematics:
-        """Kinematics at the same points in another state (collective)."""
-
-    def follow(self, state: PairState) -> tuple[Kinematics, PairState, bool]:
-        """Follow contactors from facet to facet, into and out of corners; whether equations change on this rank (collective)."""
-
-    # -- deciding quantities ---------------------------------------------------------------------------------------------
+        Returns:
+            Kinematics at the same points, the same object on all ranks unless equations change, and the state.
+        """
 
     @property
     def ends(self) -> Ends:
         """Position of contactors relative to open ends of the target; made once."""
 
-    # -- equations and forces --------------------------------------------------------------------------------------------
-
     @property
     def gap_rows(self) -> GapRows:
         """Rows of all contactors; made once."""
 
-    def forces(self, state: PairState, rows: ContactRows, multipliers: Array) -> Traction:
-        """Normal contact forces from the multipliers of rows ``(m,)``, of which only those across the target count (collective)."""
+    def forces(
+        self, state: PairState, rows: ContactRows, multipliers: Array, friction: Callable[[Array], Array] | None = None
+    ) -> Traction:
+        """Contact forces (collective).
 
-    def nodal_friction(self, tau: Array) -> Array:
-        """Forces at the contactors from multipliers ``tau (n, gdim)`` of tangential rows ``(n, gdim)`` (collective)."""
+        Args:
+            state: of the interface.
+            rows: equations of the interface.
+            multipliers: of the rows, of which only those across the target count ``(m,)``.
+            friction: function of the normal forces ``lam (n,)`` that returns the multipliers of tangential rows ``(n, gdim)``; or None.
+        """
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
         """The state's contact forces at nodes of both bodies: global nodes, repeated or not ``(k,)``, and forces ``(k, gdim)``."""
 
-    def curvature(self, state: PairState) -> list[tuple[Ints, Array]]:
-        """Blocks of ``-sum lambda grad^2 g``: lists of global nodes ``(k, m)`` and values ``(k, m gdim, m gdim)``."""
-
-    def turning(self, state: PairState, which: Ints, tau: Array, held: Bools | None = None) -> list[tuple[Ints, Array]]:
-        """Derivatives of friction forces (collective).
+    def curvature(self, state: PairState, along: Along | None = None) -> list[tuple[Ints, Array]]:
+        """Blocks of ``-sum lambda grad^2 g``, followed by those of friction (collective).
 
         Args:
             state: of the interface.
-            which: contactors, ascending; with ``at_feet`` only slipping ones ``(k,)``.
-            tau: their friction, as multipliers of tangential rows ``(k, gdim)``.
-            held: sticking contactors, with constant multipliers instead of a constant coefficient of friction ``(k,)``; None if all slip.
+            along: friction whose rows turn; None without.
 
         Returns:
-            Lists of global nodes, negative for no node, and blocks, see ``curvature``.
+            Lists of global nodes, negative for no node ``(k, m)``, and values ``(k, m gdim, m gdim)``.
         """
 
     def pressure_map(self, current: bool) -> PressureMap:
@@ -388,9 +402,6 @@ class Discretisation(Protocol):
 
     def begin_step(self) -> None:
         """Begin a step, or repeat it; contactors are placed again."""
-
-    def look_farther(self) -> bool:
-        """Extend the search from the next placement on, for unrestrained bodies: whether this can find more facets."""
 
     def place(self, points: Array, state: PairState) -> Kinematics:
         """Search the target for contactors at ``points (n, gdim)`` (collective)."""

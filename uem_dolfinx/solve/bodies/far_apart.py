@@ -136,6 +136,10 @@ class FarApart:
         then, _ = self._look(self._config.x + ways)
         return bool(self._look_at(self._boxes.apart_until(then) <= self._near))
 
+    def look_at_all(self) -> bool:
+        """Search all contacts from the next projection on; whether there are new ones."""
+        return bool(self._look_at(np.ones(len(self._pairs), dtype=bool)))
+
     @property
     def any(self) -> bool:
         """Whether any contact is not searched."""

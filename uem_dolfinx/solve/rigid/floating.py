@@ -71,16 +71,14 @@ class FloatingBodies:
         bodies: without contact.
         pairs: of all contacts.
         linear: equations of users, or None.
-        far_apart: contacts that are not searched until bodies come near; None if all contacts are searched.
+        far_apart: contacts that are not searched until bodies come near.
 
     Attributes:
         rigid: rigid motions of the bodies; None of a scalar field.
         motions: rigid motions of the present step; None if conditions, springs and inertia hold all bodies.
     """
 
-    def __init__(
-        self, bodies: Bodies, pairs: Sequence[Interface], linear: UserRows | None = None, far_apart: FarApart | None = None
-    ):
+    def __init__(self, bodies: Bodies, pairs: Sequence[Interface], linear: UserRows | None, far_apart: FarApart):
         self._bodies, self._pairs, self._linear, self._far_apart = bodies, pairs, linear, far_apart
         config, dynamics = bodies.config, bodies.dynamics
         self.rigid: RigidMotions | None = None
@@ -132,8 +130,7 @@ class FloatingBodies:
         """
         if self._bodies.dynamics is not None:
             self.motions = self._in_motion if self._bodies.dynamics.moving else self._at_rest
-        if self._far_apart is not None:
-            self._far_apart.begin_step(self.motions is not None)
+        self._far_apart.begin_step(self.motions is not None)
         if self.motions is not None:
             self._went = -self._bodies.config.displacement
             self.motions.forget_supports()
@@ -297,7 +294,7 @@ class FloatingBodies:
             if v is None:
                 return changed
             ways = motions.ways(v)
-            if self._far_apart is not None and self._far_apart.look_along(ways):
+            if self._far_apart.look_along(ways):
                 continue
             motions.config.shift(slice(None), ways)
             self._went -= ways
@@ -396,10 +393,15 @@ class FloatingBodies:
         # if no gap closes and no overlap is removed, the motion never stops
         rate, some = R @ v, OPEN * np.abs(v).max()
         if not reduced(comm, bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
-            if reduced(comm, any([pair.discretisation.look_farther() for pair in self._pairs]), op=MPI.LOR):
+            if self._look_farther():
                 return np.zeros_like(v), took
             raise motions.error(v)
         return v, took
+
+    def _look_farther(self) -> bool:
+        """Search farther from the next placement on: whether this can find more facets (collective)."""
+        lists = {id(one): one for pair in self._pairs if (one := getattr(pair.target, "neighbours", None)) is not None}
+        return any([self._far_apart.look_at_all(), *(one.look_farther() for one in lists.values())])
 
     def _ways(self, R: Any, gap: Array, v: Array) -> Array:
         """Multiple of motions ``v (n_motions,)`` at which the first gap of every body closes ``(count,)`` (collective)."""

@@ -276,7 +276,7 @@ class Exchanges:
             norm: of the residual.
 
         Returns:
-            Whether the state is a repetition, and contactors that cycle at corners use averaged normals from now on.
+            Whether the state is a repetition, and contactors that cycle at corners have averaged normals from now on.
 
         Raises:
             ConvergenceError, FrictionError: for other repetitions if no rule is left; names the contactors that cycle.
@@ -303,7 +303,10 @@ class Exchanges:
             self.convex, self._from = True, max(norm, self._from)
             return False
         self._visits, self._rounds = [], self._rounds + 1
-        calmed = reduced(comm, any([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+        calm = reduced(comm, np.array([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+        for pair in (pair for pair, some in zip(self._pairs, calm) if some):
+            pair.project()
+        calmed = bool(calm.any())
         # no rule has found the active set of the last linearised problem, and the same state was reached again
         if self._rounds == MOST_ROUNDS or (self.frozen and not calmed):
             raise self._circle(changed)

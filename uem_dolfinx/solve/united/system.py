@@ -206,9 +206,6 @@ class BodySystem:
                     at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             self._swept = not at_rest
             moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
-            if moved:
-                for pair in pairs:
-                    pair.place_again()
             here = [(pair, pair.stiffness_across(bodies.stiffness), bodies.rounding_at(pair.nodes)) for pair in pairs]
             found = [pair.violated(pair.gap, pair.traction, across, least, 0.0, self._swept) for pair, across, least in here]
             violated = count(pairs, found)
@@ -217,8 +214,6 @@ class BodySystem:
             wanting = not (at_rest and violated == 0 and not moved)
             # the residual at the beginning of a step does not include prescribed increments
             if wanting and pairs and self._led and self.exchanges.visit(first(self.unknowns.norms(residual))):
-                for pair in pairs:
-                    pair.place_again()
                 moved = True
             fallen = self.floating.fall_again(self.place, unsettled, at_rest)
             if moved or fallen:
