@@ -83,7 +83,7 @@ def station(w: float) -> dict:
         "P": float(problem.reaction(tags["load"])[1]),
         "lam": float(np.linalg.norm(contact.resultant().force)),
         "u_A": at("A").tolist(),
-        "gap": float(comm.allreduce(contact.pair.gap.sum())),
+        "gap": float(comm.allreduce(contact.pair.kinematics.gap.sum())),
         "to_end": float(np.linalg.norm(at("A") - at("end") + [40.0, 2.0])),
         "lower_tip": float(np.linalg.norm(at("end"))),
         "energy": uem.integrate(energy),

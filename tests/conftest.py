@@ -157,7 +157,7 @@ def check_state(problem: uem.UnitedProblem, scale: float) -> None:
             obeyed(contact)
         elif contact.sliding != "small":
             complementary(contact, 1e-12 * config.size, 1e-7 * scale + rounding)
-        if contact.pair.frictional:
+        if contact.pair.friction is not None:
             coulomb(contact.pair.whole, 1e-12 * config.size, 1e-7 * scale + rounding)
         balance = contact.balance()
         # where the foot stays behind, the forces of a pair lie on two lines; forces of rounding balance as they please
@@ -194,13 +194,13 @@ def lever(contact: uem.Contact) -> float:
     cut = isinstance(pair.discretisation, Contactors) and pair.discretisation.elimination.seam.any
     if isinstance(contact, uem.Preload) or cut:
         return np.inf
-    sideways = pair.frictional or pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
-    if pair.projection.offset is not None and sideways:
+    sideways = pair.friction is not None or pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
+    if pair.kinematics.projection.offset is not None and sideways:
         return np.inf
     # across a gap the averaged normals of a soft contact lean by the angle of the facets
     if contact.normal is not None and highest(pair.config.comm, pair.trial.changes) >= MOST_CHANGES:
         return 1e-6
-    return 1e-7 if contact.pair.frictional and not contact.pair.discretisation.traits.at_feet else 1e-11
+    return 1e-7 if contact.pair.friction is not None and not contact.pair.discretisation.traits.at_feet else 1e-11
 
 
 @pytest.fixture

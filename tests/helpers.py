@@ -86,7 +86,7 @@ def complementary(contact: uem.Contact, length: float, force: float) -> None:
         force: nodal forces below it are rounding.
     """
     pair, comm = contact.pair, contact.config.comm
-    lam, gap, active = pair.trial.lam, pair.gap, pair.trial.active
+    lam, gap, active = pair.trial.lam, pair.kinematics.gap, pair.trial.active
     assert lowest(comm, lam) >= -force
     assert lowest(comm, gap[~pair.off]) >= -length
     assert highest(comm, np.abs(lam[~active])) <= 0.0
@@ -181,13 +181,13 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
         problem.u.x.array[:] = u.ravel()
         system.place()
         problem.bodies.assemble()
-        pair.trial = replace(pair.trial, force=lam[:, None] * pair.projection.normal)
+        pair.trial = replace(pair.trial, force=lam[:, None] * pair.kinematics.projection.normal)
         r = problem.bodies.residual
         r.axpy(-1.0, compat.petsc_vector(contact.force))
         return r
 
     residual(smooth)
-    facets = pair.projection.facet.copy()
+    facets = pair.kinematics.projection.facet.copy()
     A = problem.bodies.update_tangent().copy()
     curvature = curvature_of(system.pairs, system.config.vector(), system._petrov_galerkin, False)
     assert curvature is not None
@@ -197,7 +197,7 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     full = plain + curvature * du
     h = 1e-5
     ahead = residual(smooth + h * direction)
-    assert highest(comm, np.abs(pair.projection.facet - facets)) == 0
+    assert highest(comm, np.abs(pair.kinematics.projection.facet - facets)) == 0
     difference = ahead - residual(smooth - h * direction)
     difference.scale(0.5 / h)
     return difference, full, plain

@@ -83,7 +83,7 @@ def _mean_places(contact: uem.Contact) -> list[Place]:
     take in what is hardly covered.
     """
     pair = contact.pair
-    gaps = np.where(pair.off, np.where(pair.kinematics.rows.ratio > 0, 0.0, np.inf), pair.gap)
+    gaps = np.where(pair.off, np.where(pair.kinematics.rows.ratio > 0, 0.0, np.inf), pair.kinematics.gap)
     return [Place(float(gap), np.zeros((0, contact.config.gdim)), bool(np.isfinite(gap))) for gap in gaps]
 
 

@@ -27,7 +27,7 @@ def gathered(contact: uem.Contact) -> tuple[np.ndarray, ...]:
     """Reference positions, pressures, tributary areas and gaps of all contactors, in the order of their positions (collective)."""
     pair = contact.pair
     areas = tributary_areas(contact.config, contact.contactor)[pair.nodes]
-    parts = comm.allgather((contact.config.X[pair.nodes], np.array(contact.pressures), areas, pair.projection.gap))
+    parts = comm.allgather((contact.config.X[pair.nodes], np.array(contact.pressures), areas, pair.kinematics.projection.gap))
     X, p, areas, gap = (np.concatenate(part) for part in zip(*parts))
     order = np.lexsort(X.T.round(12))
     return X[order], p[order], areas[order], gap[order]

@@ -61,4 +61,4 @@ class Scene:
 
 def overlap(contact: uem.Contact) -> float:
     """How deep the deepest contactor is inside the target, a length (collective)."""
-    return float(max(comm.allgather(-contact.pair.projection.gap.min(initial=0.0))))
+    return float(max(comm.allgather(-contact.pair.kinematics.projection.gap.min(initial=0.0))))

@@ -172,10 +172,10 @@ def test_feet_that_move_to_the_next_facets(wide, factorisations):
     assert problem.system.solver.condensed.beside is not None
     if not wide:
         problem.system.solver.condensed.beside = None
-    before = contact.pair.projection.facet
+    before = contact.pair.kinematics.projection.facet
     with counted() as calls:
         problem.solve()
-    moved = (contact.pair.projection.facet != before)[contact.pair.trial.active].any()
+    moved = (contact.pair.kinematics.projection.facet != before)[contact.pair.trial.active].any()
     assert any(problem.comm.allgather(bool(moved))) and calls[FACTORISATION] == factorisations
 
 

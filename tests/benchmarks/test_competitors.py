@@ -52,7 +52,7 @@ def force(contact):
 
 def overlap(contact):
     """Deepest node inside the target."""
-    return highest(COMM, -contact.pair.projection.gap)
+    return highest(COMM, -contact.pair.kinematics.projection.gap)
 
 
 @pytest.mark.parametrize("cell,degree", [("quadrilateral", 1), ("triangle", 2), ("hexahedron", 1), ("tetrahedron", 1)])
@@ -198,7 +198,7 @@ def test_barrier_never_touches(cell):
     for dhat in (1e-3, 1e-4):
         problem, touch, b = pressed("barrier", dhat, cell=cell)
         run(problem)
-        gap = touch.pair.projection.gap
+        gap = touch.pair.kinematics.projection.gap
         assert gap.min() > 0 and gap.min() < dhat
         assert abs(problem.reaction(b.top)[-1] / force(touch) + 1) < 1e-4
         errors.append(abs(force(touch) / force(contact) - 1))

@@ -126,12 +126,12 @@ def test_nothing_is_searched_twice():
     assert calls[SEARCH] == 0
     for surface in (b.high, b.low):
         nodes = fem.locate_dofs_topological(b.V, 1, surface.entities)
-        gaps = pair.gap.copy()
+        gaps = pair.kinematics.gap.copy()
         b.u.x.array.reshape(-1, 2)[nodes, 1] += 0.01
         with counted() as calls:
             pair.project()
         assert calls[SEARCH] > 0
-        assert max(COMM.allgather(np.abs(pair.gap - gaps).max(initial=0.0))) == pytest.approx(0.01, rel=1e-9)
+        assert max(COMM.allgather(np.abs(pair.kinematics.gap - gaps).max(initial=0.0))) == pytest.approx(0.01, rel=1e-9)
 
 
 # -- the first run ever --------------------------------------------------------------------------------------------------------

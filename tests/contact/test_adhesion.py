@@ -76,13 +76,13 @@ def test_the_tangent_is_the_derivative(cell):
         return -config.add_at_owners(*pair.applied_forces()).ravel()
 
     forces(smooth)
-    facets, du, h = pair.projection.facet.copy(), config.vector(), 1e-6
+    facets, du, h = pair.kinematics.projection.facet.copy(), config.vector(), 1e-6
     nodes, K, _ = pair.slip_terms()
     of_gaps, bends = contact_curvature([(nodes, K)], config.vector()), curvature_of([pair], config.vector(), True, False)
     du.array[:] = direction[: config.n_owned].ravel()
     wanted, found = of_gaps * du + bends * du, config.vector()
     found.array[:] = (forces(smooth + h * direction) - forces(smooth - h * direction)) / (2 * h)
-    assert highest(COMM, np.abs(pair.projection.facet - facets)) == 0
+    assert highest(COMM, np.abs(pair.kinematics.projection.facet - facets)) == 0
     assert wanted.norm() > 0 and (found - wanted).norm() < 1e-5 * wanted.norm()
 
 

@@ -77,7 +77,7 @@ def test_gaps_of_contactors_behind_edges(cell, sliding, scale):
     )
     uem.UnitedProblem(F, u, contacts=[contact])
     pair, config = contact.pair, contact.pair.config
-    p, x = pair.projection, config.X[: config.n_owned]
+    p, x = pair.kinematics.projection, config.X[: config.n_owned]
     past = (p.gap < 0) & ((p.weights < -1e-6) | (p.weights > 1 + 1e-6)).any(axis=1)
     assert COMM.allreduce(int(past.sum())) >= 2
     gaps = pair.kinematics.gap_rows.gaps
@@ -92,7 +92,7 @@ def test_gaps_of_contactors_behind_edges(cell, sliding, scale):
         u.x.array[: x.size] = h * du.ravel()
         u.x.scatter_forward()
         pair.project()
-        left = pair.projection.gap - p.gap - h * (gaps(du) - p.gap)
+        left = pair.kinematics.projection.gap - p.gap - h * (gaps(du) - p.gap)
         error.append(COMM.allreduce(float(np.abs(left)[past].max(initial=0.0)), op=MPI.MAX))
     assert error[1] < 0.02 * error[0] and error[0] < 1e-4 * scale
 
@@ -109,6 +109,6 @@ def test_shallow_edges(slope, goes_on, scale):
     uem.UnitedProblem(F, u, contacts=[contact])
     pair = contact.pair
     bottom = np.abs(pair.config.X[pair.nodes, 0]) < 1e-3 * scale
-    weights = pair.projection.weights[bottom]
+    weights = pair.kinematics.projection.weights[bottom]
     assert COMM.allreduce(len(weights)) == 1
     assert COMM.allreduce(int(((weights < -1e-6) | (weights > 1 + 1e-6)).any())) == goes_on

@@ -183,7 +183,7 @@ def test_nonnegative_control_gaps_leave_no_overlap(top, seed, zeros):
         nodal = np.array(top.u.x.array.reshape(-1, top.g)[:, -1])
     top.open(nodal)
     assert COMM.allreduce(int((~top.pair.kinematics.control.shared).sum())) == 0
-    assert highest(COMM, np.abs(top.pair.gap - wanted[top.pair.nodes])) < 1e-15
+    assert highest(COMM, np.abs(top.pair.kinematics.gap - wanted[top.pair.nodes])) < 1e-15
     assert lowest(COMM, [top.sampled(nodal, seed)]) >= -1e-15
 
 
@@ -304,7 +304,7 @@ def test_rim_is_the_same_on_any_number_of_ranks(cell, n):
         lawful(contact, force=10.0)
         assert max(factors(history), default=0.0) < 20
         pair = contact.pair
-        rows = np.column_stack([problem.config.X[pair.nodes], pair.trial.active, contact.pressures, pair.gap])
+        rows = np.column_stack([problem.config.X[pair.nodes], pair.trial.active, contact.pressures, pair.kinematics.gap])
         rows = np.concatenate(comm.allgather(rows))
         answers.append((rows[np.lexsort(np.round(rows[:, : len(n) - 1], 9).T)], len(history)))
     (rows, count), (alone, count_alone) = answers

@@ -59,7 +59,7 @@ def test_as_if_the_body_with_corners_were_the_contactor(make, how):
     assert contact.further[0].n_active == 0 < COMM.allreduce(int(contact.further[0].pair.trial.active.sum()))
     balance = contact.balance()
     assert balance.force < 1e-12 and balance.moment < 1e-9
-    deepest = COMM.allreduce(float(np.min(contact.further[0].pair.projection.gap, initial=np.inf)), op=MPI.MIN)
+    deepest = COMM.allreduce(float(np.min(contact.further[0].pair.kinematics.projection.gap, initial=np.inf)), op=MPI.MIN)
     out = contact.further[0].pair.off
     assert deepest > -1e-9 * contact.config.size or COMM.allreduce(int(out.sum()))
 

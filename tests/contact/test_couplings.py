@@ -44,13 +44,13 @@ def test_equations_against_a_loop(cell):
     assert np.array_equal(np.sort(rows.contactor), np.arange(len(pair.nodes)))
     du = np.cos(5 * config.X + 1)
     of_all = np.concatenate(COMM.allgather(du[: config.n_owned]))
-    eq, p = rows.P, pair.projection
+    eq, p = rows.P, pair.kinematics.projection
     left = np.einsum("mg,mg->m", eq.direction, du[eq.node])
     np.subtract.at(left, eq.row, np.einsum("kg,kg->k", eq.coefficients, of_all[eq.followed]))
     for k, i in enumerate(rows.contactor):
         n = p.normal[i]
         wanted = n @ du[pair.nodes[i]] - sum(w * (n @ of_all[a]) for w, a in zip(p.weights[i], p.nodes[i]))
-        assert left[k] == pytest.approx(wanted, rel=1e-13, abs=1e-15) and eq.gap[k] == pair.gap[i]
+        assert left[k] == pytest.approx(wanted, rel=1e-13, abs=1e-15) and eq.gap[k] == pair.kinematics.gap[i]
 
 
 @pytest.mark.parametrize(("cell", "degree"), [("triangle", 1), ("triangle", 2), ("hexahedron", 1)])
@@ -130,9 +130,9 @@ def test_nodal_gaps_for_other_methods():
     """A coupling of degree 2 can be had without control gaps; nodal gaps then decide."""
     _, _, contact = pressed("triangle", 2)
     pair = contact.pair
-    control = pair.gap.copy()
+    control = pair.kinematics.gap.copy()
     pair.discretisation = NodeToSurface.like(pair.discretisation)
     pair.project()
-    assert np.array_equal(pair.gap, pair.projection.gap)
+    assert np.array_equal(pair.kinematics.gap, pair.kinematics.projection.gap)
     pair.trial = replace(pair.trial, active=np.zeros(len(pair.nodes), bool))
-    assert highest(COMM, np.abs(control - pair.gap)) < 1.0
+    assert highest(COMM, np.abs(control - pair.kinematics.gap)) < 1.0

@@ -114,7 +114,7 @@ def test_coulomb(on_edge):
     for part in r.edges:
         coulomb(part.pair, 1e-11, 1e-7)
         f, on = part.pair.trial.friction, part.pair.trial.active
-        tau, normal = f.tau[on], part.pair.projection.normal[on]
+        tau, normal = f.tau[on], part.pair.kinematics.projection.normal[on]
         assert highest(COMM, np.abs(np.einsum("ng,ng->n", tau, normal))) < 1e-9
         assert highest(COMM, np.abs(np.linalg.norm(tau, axis=1) - mu * part.pair.trial.lam[on])) < 1e-7
     assert sum(part.dissipation for part in r.edges) > 0.05 * 0.3 * 0.8

@@ -169,7 +169,7 @@ def test_tangent_by_differences(cell):
         problem.system.place()
         problem.bodies.assemble()
         pair.trial = replace(
-            pair.trial, force=lam[:, None] * (pair.projection.normal - mu * pair.friction.directions(pair.trial))
+            pair.trial, force=lam[:, None] * (pair.kinematics.projection.normal - mu * pair.friction.directions(pair.trial))
         )
         r = problem.bodies.residual
         r.axpy(-1.0, compat.petsc_vector(scene.contact.force))

@@ -61,7 +61,7 @@ def pushed(contact, before):
     """
     pair = contact.pair
     t, g = pair.trial, pair.config.gdim
-    out, c = t.lam[:, None] * pair.projection.normal, pair.kinematics.corners
+    out, c = t.lam[:, None] * pair.kinematics.projection.normal, pair.kinematics.corners
     for k, i in [] if c is None else enumerate(c.which):
         assert c.count[k] == 2
         n = c.normals[k, :2] if t.facet[i] == before[i] or t.held[i, 0] != before[i] else c.normals[k, 1::-1]

@@ -116,8 +116,8 @@ def test_rows_and_curvature_against_differences(cell, target):
     for h in (1e-6, -1e-6, 0.0):
         b.u.x.array[:] = (start + h * way).ravel()
         pair.project()
-        gaps.append(pair.gap)
-    slope = pair.kinematics.gap_rows.gaps(way[: config.n_owned]) - pair.gap
+        gaps.append(pair.kinematics.gap)
+    slope = pair.kinematics.gap_rows.gaps(way[: config.n_owned]) - pair.kinematics.gap
     assert highest(COMM, np.abs((gaps[0] - gaps[1]) / 2e-6 - slope)) < 1e-8
     b.u.x.array[:] = 0.0
     difference, full, plain = (gathered_vector(v) for v in tangent_by_differences(problem, contact))

@@ -125,7 +125,7 @@ def pressures_by_axis(contact, g):
     for part in contact.parts:
         pair = part.pair
         on, pressures = pair.trial.active, part.pressures
-        axis = np.abs(pair.projection.normal[on]).argmax(axis=1)
+        axis = np.abs(pair.kinematics.projection.normal[on]).argmax(axis=1)
         told.append(np.column_stack([pair.config.to_global(pair.nodes[on]) * g + axis, pressures[on]]))
     told = np.concatenate(COMM.allgather(np.concatenate(told)))
     key, which = np.unique(told[:, 0], return_inverse=True)

@@ -160,7 +160,7 @@ def test_the_tangent_by_gaps_and_pressures():
         bars = Bars(h, gap=gap, coupling="mortar", n=4)
         run(bars.problem)
         heat, c = bars.contact.pair.heats[0], bars.contact
-        g, p = c.pair.projection.gap, c.pressures
+        g, p = c.pair.kinematics.projection.gap, c.pressures
         slopes = wanted(p, np.where(c.pair.united, 0.0, g)) * heat.jump() * heat.passage.areas
         assert highest(COMM, np.abs(heat._slopes(0 if gap == 0.0 else 1)[0] / slopes - 1.0)) < 2.5e-8
     bars = Bars(lambda p, g: 0.05 / (0.01 + g), gap=0.1, n=4, coupling="mortar")

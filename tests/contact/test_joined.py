@@ -264,7 +264,7 @@ def test_facets_keep_their_numbers():
     problem.solve()
     for contact in contacts:
         pair = contact.pair
-        p = pair.projection
+        p = pair.kinematics.projection
         assert np.array_equal(pair.committed.facet, p.facet) and (p.facet >= 0).all()
         own = pair.target.project(pair.points)
         assert np.array_equal(own.facet, p.facet) and np.array_equal(own.nodes, p.nodes)

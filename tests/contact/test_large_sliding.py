@@ -50,7 +50,7 @@ def slider(cell, way, *, pose=lambda x: x, target=None, normals="facet", start=0
 def facets_met(contact):
     """Facets under active contactors, on all ranks."""
     pair = contact.pair
-    return {int(f) for part in COMM.allgather(pair.projection.facet[pair.trial.active]) for f in part}
+    return {int(f) for part in COMM.allgather(pair.kinematics.projection.facet[pair.trial.active]) for f in part}
 
 
 def waved(height):

@@ -172,6 +172,6 @@ def test_a_discretisation_from_outside():
     coated, _ = dragged("quadrilateral", 0.0, press=0.01, way=0.0, coupling=Coated)
     forces = [np.array(contact.resultant().force) for contact in (plain, coated)]
     np.testing.assert_allclose(forces[1][1], forces[0][1], rtol=0.02)
-    p = coated.pair.projection
+    p = coated.pair.kinematics.projection
     true = np.einsum("ng,ng->n", p.normal, coated.pair.points - p.foot)
     assert np.abs(true - Coated.thickness_of_coating)[coated.pair.trial.active].max(initial=0.0) <= 1e-12

@@ -132,7 +132,7 @@ def test_over_an_edge():
     uem.UnitedProblem(st_venant(u, modulus(s, 1.0, 1.0)), u, bcs=bcs, contacts=[contact]).solve()
     pair = contact.pair
     i = np.flatnonzero(pair.trial.active)
-    away = pair.points[i] - pair.projection.foot[i]
+    away = pair.points[i] - pair.kinematics.projection.foot[i]
     assert contact.n_active == 1
     assert highest(COMM, np.abs(np.linalg.norm(away, axis=1) - 0.1)) < 1e-13
     assert contact.balance().moment < 1e-12
@@ -228,4 +228,4 @@ def test_named_errors():
         contact.offset = value
 
     raised(uem.InputError, "offset = inf: expected a finite number", lambda: set_it(np.inf))
-    assert contact.offset == 0.0 and lowest(COMM, contact.pair.gap) > -1e-14
+    assert contact.offset == 0.0 and lowest(COMM, contact.pair.kinematics.gap) > -1e-14

@@ -69,7 +69,9 @@ def test_sliding_along_a_polygon(cell, height, normals):
         assert step.cuts == 0 and step.newton_iterations <= (12 if normals == "facet" else 20)
         complementary(contact, 1e-12, 1e-10)
         touched.append(contact.n_active)
-        facets |= {int(f) for part in COMM.allgather(contact.pair.projection.facet[contact.pair.trial.active]) for f in part}
+        facets |= {
+            int(f) for part in COMM.allgather(contact.pair.kinematics.projection.facet[contact.pair.trial.active]) for f in part
+        }
     assert min(touched[1:]) > 0
     assert len(facets) > 3
 

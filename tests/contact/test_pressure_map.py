@@ -70,7 +70,7 @@ def test_areas_are_affine(cell, degree, coupling, friction, current):
     """Areas change with integrals of shape functions by ``along``, whose transpose is ``back``, and so do stretches."""
     config, pair, contact = over_an_arch(cell, degree, coupling, friction)
     found, X = pair.kinematics.pressure_map(current), config.X[pair.nodes]
-    a = contact.areas_facing(pair.nodes, pair.projection.normal, current)
+    a = contact.areas_facing(pair.nodes, pair.kinematics.projection.normal, current)
     d, w = np.cos(4 * X.sum(axis=1)), np.sin(3 * X.sum(axis=1) + 1)
     assert highest(COMM, np.abs(found.areas(a + d) - found.areas(a) - found.along(d))) < 1e-13
     assert total((w, found.along(d))) == pytest.approx(total((found.back(w), d)), rel=1e-11, abs=1e-13)

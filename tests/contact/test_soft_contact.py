@@ -314,7 +314,7 @@ def test_the_tangent_is_the_derivative(cell):
         return system.residual()
 
     assert highest(COMM, np.abs(residual(smooth).array_r)) > 0 and COMM.allreduce(int((pair.trial.lam > 0).sum())) > 2
-    facets = pair.projection.facet.copy()
+    facets = pair.kinematics.projection.facet.copy()
     K = problem.bodies.update_tangent().copy()
     nodes, blocks_of_gaps, left = pair.slip_terms()
     assert highest(COMM, np.abs(left)) < 1e-12
@@ -325,7 +325,7 @@ def test_the_tangent_is_the_derivative(cell):
     wanted = K * du + of_gaps * du + bends * du
     h = 1e-6
     found = residual(smooth + h * direction) - residual(smooth - h * direction)
-    assert highest(COMM, np.abs(pair.projection.facet - facets)) == 0
+    assert highest(COMM, np.abs(pair.kinematics.projection.facet - facets)) == 0
     found.scale(0.5 / h)
     assert (found - wanted).norm() < 1e-6 * wanted.norm()
     assert (bends * du).norm() > 1e-4 * wanted.norm() and (of_gaps * du).norm() > 1e-2 * wanted.norm()

@@ -108,7 +108,7 @@ def test_what_does_not_touch_stays_in_contact():
     contact.tie()
     pull.value[1] = -0.02
     problem.solve()
-    assert contact.n_active > some and lowest(COMM, contact.pair.gap[~contact.pair.tied]) > -1e-13
+    assert contact.n_active > some and lowest(COMM, contact.pair.kinematics.gap[~contact.pair.tied]) > -1e-13
     pull.value[1] = 0.001
     problem.solve()
     assert contact.n_active == some and contact.resultant().force[1] == pytest.approx(-0.001, rel=1e-9)

@@ -181,7 +181,9 @@ def test_edges_that_coincide_do_not_slip_off(width, degree):
         pair = landing.problem.pairs[0]
         assert landing.contacts[0].n_active == COMM.allreduce(len(pair.nodes))
         assert COMM.allreduce(int(pair.trial.at_end.sum())) == 2
-        past.append(highest(COMM, np.linalg.norm(pair.projection.beyond, axis=1) / pair.projection.facet_size))
+        past.append(
+            highest(COMM, np.linalg.norm(pair.kinematics.projection.beyond, axis=1) / pair.kinematics.projection.facet_size)
+        )
         harmless(Landing(1.5, 1.5, block, width=width, nu=0.3, degree=degree, cells=6).run(2.0), 0.5)
     assert max(past) > 1e-5
 

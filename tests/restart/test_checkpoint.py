@@ -230,9 +230,9 @@ def test_going_on_is_not_having_stopped(cell, normals, folder):
     """Ten steps over the facets, and the last six of them from a file: the same bits in serial, the same to 1e-9 on more ranks."""
     s, contact, whole = slider(COMM, cell, normals=normals)
     iterations = lead(whole, range(1, 5))
-    facets = contact.pair.projection.facet.copy()
+    facets = contact.pair.kinematics.projection.facet.copy()
     iterations += lead(whole, range(5, 11))
-    moved = contact.pair.trial.active & (contact.pair.projection.facet != facets)
+    moved = contact.pair.trial.active & (contact.pair.kinematics.projection.facet != facets)
     assert contact.n_active > 0 and COMM.allreduce(int(moved.sum())) > 0
     # written by one rank, read by all
     if COMM.rank == 0:
@@ -286,7 +286,7 @@ def test_moving_rigid_surface(sliding, coupling, folder):
     t, ball, contact, other = pressed()
     uem.read_checkpoint(folder / "run", other.state())
     assert ball.reference(2) == pytest.approx([0.53, 1.44], abs=0.0, rel=1e-15)
-    assert highest(COMM, np.abs(contact.pair.gap - gap)) <= (0.0 if COMM.size == 1 else 1e-14)
+    assert highest(COMM, np.abs(contact.pair.kinematics.gap - gap)) <= (0.0 if COMM.size == 1 else 1e-14)
     lead(other, range(4, 7))
     u, v = s.gather(whole.u), t.gather(other.u)
     assert np.abs(u).max() > 0.01 and np.abs(u - v).max() <= (0.0 if COMM.size == 1 else 1e-9 * np.abs(u).max())

@@ -61,7 +61,7 @@ def test_curvature_without_equations(again):
     free = problem.bodies.free[: config.n_owned]
     none = Restriction(config, UnitingEquations.join([], config.gdim), free, np.zeros(free.shape))
     K, pair = problem.bodies.update_tangent(), problem.contacts[0].pair
-    nodes = np.column_stack([config.to_global(pair.nodes), pair.projection.nodes])
+    nodes = np.column_stack([config.to_global(pair.nodes), pair.kinematics.projection.nodes])
     size = nodes.shape[1] * config.gdim
     blocks_of = np.random.default_rng(COMM.rank).normal(size=(len(nodes), size, size))
     G = contact_curvature([(nodes, blocks_of + blocks_of.transpose(0, 2, 1))], K.createVecRight())

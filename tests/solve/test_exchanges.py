@@ -20,6 +20,7 @@ from helpers import Body, at, blocks, box, clamp, linear, modulus, raised, run, 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.contact.friction.stick_slip import FrictionViolations, Seen
+from uem_dolfinx.contact.nodes.concave_edges import HOLD_AFTER
 from uem_dolfinx.contact.seam.active_set import Pivoting, Rule, Violations
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.solve.united import exchanges as exchanges_of_a_step
@@ -36,21 +37,22 @@ class Nodes:
         config = SimpleNamespace(
             comm=COMM, X=X, gdim=X.shape[1], size=1.0, describe=lambda i: "(" + ", ".join(f"{c:.6g}" for c in X[i]) + ")"
         )
-        self.config, self.nodes, self.name, self.frictional, self.friction = config, np.arange(len(X)), name, frictional, None
-        self.members, self.label, self.name_at = [self], np.zeros(len(X), int), lambda i: name
-        self.active, self.calmed, self.trial = np.zeros(len(X), bool), False, SimpleNamespace(active=np.ones(len(X), bool))
+        self.config, self.nodes, self.name, self.members = config, np.arange(len(X)), name, [self]
+        self.friction = SimpleNamespace(hold_limits=lambda lam: None) if frictional else None
+        self.discretisation = SimpleNamespace(setting=SimpleNamespace(label=np.zeros(len(X), int)))
+        here = PairState.initial(len(X), config.gdim)
+        self.trial = replace(here, active=np.ones(len(X), bool), changes=np.full(len(X), HOLD_AFTER))
 
-    @property
-    def pattern(self):
-        return self.active[:, None].astype(np.int64)
+    def be_active(self, which):
+        """Let these of all contactors be active."""
+        self.trial = replace(self.trial, active=self.of_all(which))
+
+    def project(self):
+        """They stay where they are."""
 
     def of_all(self, values):
         """This rank's part of what all contactors have."""
         return np.asarray(values)[COMM.rank :: COMM.size]
-
-    def calm(self, which):
-        calm, self.calmed = self.calmed, True
-        return not calm
 
 
 def wrong(pair, which, alike=True):
@@ -98,7 +100,7 @@ def test_who_goes_in_a_circle_is_named():
             for k in range(100):
                 which = np.zeros(6, bool)
                 which[[1, 2, 4, 5][k % 4]] = True
-                pair.active = pair.of_all(which)
+                pair.be_active(which)
                 exchanges.choose([wrong(pair, which)], (), False)
 
         found = raised(error, "the active set cycles", exchange_for_ever)
@@ -145,7 +147,7 @@ def test_convex_until_it_gets_better():
     """A state that comes again and again although no contactor changes gets a convex tangent, until a tenth of the residual is left."""
     pair = Nodes([(0.0, 0.0), (1.0, 0.0)])
     exchanges = Exchanges([pair])
-    pair.active = pair.of_all([True, False])
+    pair.be_active([True, False])
     convex = []
     for norm in (1.0, 0.5, 0.6, 0.6, 0.6, 0.9, 0.091, 0.05, 0.04, 0.07):
         exchanges.visit(norm)
@@ -196,7 +198,7 @@ def test_states_that_come_again():
     exchanges = Exchanges([pair])
 
     def visit(first, norm):
-        pair.active = pair.of_all([first, True, False])
+        pair.be_active([first, True, False])
         return exchanges.visit(norm)
 
     # it gets better, then nothing changes, then it the active set cycles

@@ -97,7 +97,7 @@ def test_a_field_that_changes_within_the_step(name):
         same(arrays, wanted, 1e-8)
         assert work == pytest.approx(total, rel=1e-7, abs=1e-14)
     assert staggered.problem.progress.steps == len(states) == 2
-    if whole.contact.pair.frictional:
+    if whole.contact.pair.friction is not None:
         assert whole.contact.dissipation > 0
 
 

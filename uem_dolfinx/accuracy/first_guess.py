@@ -27,7 +27,7 @@ def refuse_first_guess(problem: UnitedProblem) -> None:
     """Refuse problems whose solution depends on the path to it."""
     for present, what in (
         (bool(problem.materials), "a law with history"),
-        (any(pair.frictional for pair in problem.pairs), "friction"),
+        (any(pair.friction is not None for pair in problem.pairs), "friction"),
         (any(contact.cohesion is not None for contact in problem.contacts), "cohesion"),
     ):
         if present:

@@ -222,7 +222,7 @@ class Contact(WatchedContact, given.Sealed):
             given.kind("friction", value, type(law) is type(before), f"a value for the law {type(before).__name__}")
         given.alike(self.config.comm, f"contact '{self.name}'", friction=parameters(law))
         mu = self._friction_at(law, self.pair.nodes, self._at)
-        if mu is not None and not self.pair.frictional:
+        if mu is not None and self.pair.friction is None:
             raise InputError(
                 f"contact '{self.name}': friction = {given.shown(value)} comes too late, the contact has been made without: make it with "
                 "the friction that it is to have, and set friction = 0 until then"
@@ -232,7 +232,7 @@ class Contact(WatchedContact, given.Sealed):
 
     def _take_friction(self, law: FrictionLaw, mu: Array | None) -> None:
         """Set a friction law with these values at the contactors ``(n,)``, None for zeros (collective)."""
-        if self.pair.frictional:
+        if self.pair.friction is not None:
             self.pair.set_friction(law, np.zeros(len(self.pair.nodes)) if mu is None else mu)
         for part in self.further:
             part._take_friction(law, self._friction_at(law, part.nodes, self._at))
@@ -253,10 +253,8 @@ class Contact(WatchedContact, given.Sealed):
             return
         value, friction = self._friction_at(law, self.pair.nodes, at), self.pair.friction
         assert value is not None and friction is not None
-        if known:
-            self.pair.know_friction(law, value)
-        elif reduced(self.config.comm, not np.array_equal(value, friction.value), op=MPI.LOR):
-            self.pair.set_friction(law, value)
+        if known or reduced(self.config.comm, not np.array_equal(value, friction.value), op=MPI.LOR):
+            self.pair.set_friction(law, value, known)
 
     def friction_values(self) -> Array:
         """Friction parameters at this rank's contactors; empty without friction."""
@@ -352,12 +350,12 @@ class Contact(WatchedContact, given.Sealed):
         self.contactor = as_tag(self.contactor, config.mesh, (facets, 0), "contactor")
         nodes, target = self._sides(config)
         thickness = np.inf if self.thickness is None else self.thickness
-        of: dict[str, Any] = {"name": self.name, "sliding": self.sliding}
+        of: dict[str, Any] = {"name": self.name}
         of["max_penetration"] = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
         friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
         tie, kind = self._tie(nodes, discretisation, means, **of), kind_of_interface(self, duration)
-        self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, thickness=thickness, **of), None
+        self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, **of), None
         if tie is not None and self.tied != "after":
             self._pair.project()
             self._pair.unite()
@@ -435,7 +433,7 @@ class Contact(WatchedContact, given.Sealed):
         """
         if self.tied != "after":
             raise InputError(f"contact '{self.name}': tie() is for contacts that are made with tied='after'")
-        near = self.pair.projection.gap <= given.number("reach", reach, given.NOT_NEGATIVE)
+        near = self.pair.kinematics.projection.gap <= given.number("reach", reach, given.NOT_NEGATIVE)
         self.pair.unite(self.pair.committed.active | (near & ~self.pair.off & (reach > 0.0)))
         self.pair.project()
 

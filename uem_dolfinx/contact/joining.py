@@ -123,11 +123,11 @@ def _kind(contact: Contact) -> Hashable:
     if not rigid and not (type(contact) is Contact and type(pair.target) is MeshTarget):
         return None
     nodal = (type(pair), type(pair.discretisation)) == (Interface, NodeToSurface)
-    if not nodal or contact.further or pair.sliding != "finite" or pair.tie is not None or pair.heats:
+    if not nodal or contact.further or contact.sliding != "finite" or pair.tie is not None or pair.heats:
         return None
     if pair.friction is not None and not _joins(pair.friction):
         return None
-    return rigid, pair.frictional, pair.target.averaged, pair.thickness
+    return rigid, pair.friction is not None, pair.target.averaged, contact.thickness
 
 
 def _joins(friction: Sliding) -> bool:

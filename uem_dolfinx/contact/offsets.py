@@ -68,6 +68,6 @@ class Offsets:
         """
         pair = self.pair
         pair.project()
-        p, height = pair.projection, pair.kinematics.heights()
+        p, height = pair.kinematics.projection, pair.kinematics.heights()
         most = np.where(np.isfinite(p.facet_size), p.facet_size, pair.max_penetration) if reach is True else reach
         self.adjusted = np.where((np.abs(height) <= most) & ~pair.off, height, 0.0)

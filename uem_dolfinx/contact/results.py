@@ -154,8 +154,9 @@ class ContactResults(HeatResults):
     def measured_areas(self) -> Array:
         """Areas for pressures and tractions at contactors ``(n_contactors,)``, zero where there is no area (collective)."""
         current = self.measure == "current"
-        facing = self.areas_facing(self.nodes, self.pair.projection.normal, current)
-        return self._seam.evenly(self.nodes, self.pair.areas(facing, current, self._areas))
+        facing = self.areas_facing(self.nodes, self.pair.kinematics.projection.normal, current)
+        found, tie = self.pair.kinematics.pressure_map(current).areas(facing), self.pair.tie
+        return self._seam.evenly(self.nodes, found if tie is None else tie.areas(facing, self._areas, found))
 
     @cached_property
     def _seam(self) -> Seam:
@@ -237,7 +238,7 @@ class ContactResults(HeatResults):
 
         f = self._field("pressure_to_integrate", 0.0)
         if self.contactor.dim > 0:
-            normal = None if self.coupling == "mortar" else self.pair.projection.normal
+            normal = None if self.coupling == "mortar" else self.pair.kinematics.projection.normal
             areas = self._seam.evenly(self.nodes, self.surface.of_functions(self.nodes, normal, lambda shape: basis_of(shape).T))
             pressed, _ = self._with_further(*self.pair.pressing())
             f.x.array[: self.config.n_owned] = density(self.config, self.contactor, self.nodes, pressed, areas)
@@ -247,8 +248,10 @@ class ContactResults(HeatResults):
     @property
     def gap(self) -> fem.Function:
         """Gap as a scalar field, a length; zero off the contactor (collective)."""
-        self.pair.look()
-        return self._field("gap", self.pair.projection.gap)
+        if self.pair.far:
+            self.pair.search()
+            self.pair.project()
+        return self._field("gap", self.pair.kinematics.projection.gap)
 
     @property
     def active(self) -> fem.Function:
@@ -374,7 +377,7 @@ class ContactResults(HeatResults):
             InputError, InputTypeError: for an unknown body, or a point that is not finite.
         """
         given.word("on", on, ("contactor", "target"))
-        target, p, g = self.pair.target, self.pair.projection, self.config.gdim
+        target, p, g = self.pair.target, self.pair.kinematics.projection, self.config.gdim
         centre = np.zeros(g) if about is None else given.vector("about", about, g)
         x, f = self.acting_at(), self.pair.trial.force
         if on == "target":

@@ -104,7 +104,9 @@ def _distances(contactors: Indices, contacts: Sequence[Contact]) -> Array:
     for contact in contacts:
         pair = contact.pair
         # the closest point on a rigid surface is the contactor itself
-        away = np.maximum(np.linalg.norm(pair.points - pair.projection.foot, axis=1), np.abs(pair.projection.gap))
+        away = np.maximum(
+            np.linalg.norm(pair.points - pair.kinematics.projection.foot, axis=1), np.abs(pair.kinematics.projection.gap)
+        )
         np.minimum.at(found, np.searchsorted(contactors, pair.nodes), away)
     return found
 

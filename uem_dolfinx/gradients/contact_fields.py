@@ -64,7 +64,7 @@ def by_contacts(at: Any, m: fem.Function, by_gaps: Array, a: Array) -> tuple[Int
 def _slopes(at: Any, k: int, contact: Contact, m: fem.Function, by_gaps: Array, a: Array) -> list[tuple[Ints, Array]]:
     """Contactors of one contact, and derivatives by their values."""
     found: list[tuple[Ints, Array]] = []
-    if as_law(contact.friction).field is m and contact.pair.frictional:
+    if as_law(contact.friction).field is m and contact.pair.friction is not None:
         found.append((np.arange(len(contact.pair.nodes)), -rubbed_along(contact.pair, a)))
     if contact.offset is m:
         which = at.equations_of(k, "its offset")
@@ -77,7 +77,7 @@ def along_field(at: Any, m: fem.Function, change: Array) -> tuple[Array, Array]:
     """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` along changes of a Function's local values (collective)."""
     gaps, pushed = np.zeros_like(at.multipliers), np.zeros((at.config.n_owned, at.config.gdim))
     for k, contact in enumerate(at.problem.contacts):
-        if as_law(contact.friction).field is m and contact.pair.frictional:
+        if as_law(contact.friction).field is m and contact.pair.friction is not None:
             pushed = pushed + rubbed(contact.pair, change[_entries(at, m, contact)])
         if contact.offset is m:
             which = at.equations_of(k, "its offset")

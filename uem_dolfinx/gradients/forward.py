@@ -67,7 +67,7 @@ class Forward:
     def begin(self, first: Record) -> None:
         """Compute changes of the anchors before the first step (collective)."""
         problem = self.problem
-        if not any(pair.frictional for pair in problem.pairs):
+        if not any(pair.friction is not None for pair in problem.pairs):
             return
         Memory.put_back(first.before, problem)
         places, shape = Places(problem.config), np.zeros((problem.config.n_owned, problem.config.gdim))

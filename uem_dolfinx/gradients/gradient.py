@@ -185,7 +185,7 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
         for present, what in (
             (problem.dynamics is not None, "a problem in time"),
             (bool(problem.materials), "a law with history"),
-            (any(pair.frictional for pair in problem.pairs), "a contact with friction"),
+            (any(pair.friction is not None for pair in problem.pairs), "a contact with friction"),
         ):
             if present and not recorded:
                 raise InputError(
@@ -360,7 +360,7 @@ def _check_parameter(problem: UnitedProblem, what: str, m: ContactParameter) -> 
         raise InputError(
             f"{what} is of contact '{m.contact.name}', whose corners or edges touch: expected corners=False, edges=False"
         )
-    if m.parameter == "friction" and not m.contact.pair.frictional:
+    if m.parameter == "friction" and m.contact.pair.friction is None:
         raise InputError(
             f"{what} is the friction of contact '{m.contact.name}', which has none: expected a contact with friction"
         )
@@ -404,7 +404,7 @@ def _check_shape(problem: UnitedProblem) -> None:
     config = problem.config
     if not Places(config).known:
         raise InputError("a gradient by the shape needs straight cells, or cells of the displacement's degree")
-    if any(pair.sliding != "finite" for pair in problem.pairs):
+    if any(pair.discretisation.traits.sliding != "finite" for pair in problem.pairs):
         raise InputError(
             "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"
         )

@@ -276,7 +276,7 @@ class History(given.Sealed):
         load = problem.load if isinstance(problem.load, Mapping) else {}
         density = None if dynamics is None else dynamics.mass.density
         made_of = [] if density is None else list(traverse_unique_terminals(density))
-        varied = [c.name for c in problem.contacts if c.pair.frictional and is_of_position(as_law(c.friction).field)]
+        varied = [c.name for c in problem.contacts if c.pair.friction is not None and is_of_position(as_law(c.friction).field)]
         with agreed(problem.comm):
             refuse_kept_projections(problem, len(self))
             for k, m in enumerate(controls):

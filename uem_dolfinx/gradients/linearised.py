@@ -188,7 +188,7 @@ class Linearised:
         assert isinstance(system, BodySystem)
         for pair in system.pairs:
             now, rounding = pair.trial, bodies.rounding_at(pair.nodes)
-            touches = ~now.active & ~pair.off & (np.abs(pair.gap) <= CLOSED * self.config.size)
+            touches = ~now.active & ~pair.off & (np.abs(pair.kinematics.gap) <= CLOSED * self.config.size)
             idle += int(((now.active & (now.lam <= rounding)) | touches).sum())
         if idle := reduced(self.config.comm, idle):
             logger.warning(

@@ -61,7 +61,7 @@ def recording(
         if is_explicit(problem.dynamics):
             raise InputError("steps of CentralDifferences have no derivatives: take an implicit scheme, as uem.newmark()")
         for contact in problem.contacts:
-            if contact.pair.frictional:
+            if contact.pair.friction is not None:
                 _check_first(problem, f"those of contact '{contact.name}' with friction")
                 _check_friction(problem, contact)
             if problem.dynamics is not None and contact.sliding == "small":

@@ -153,7 +153,7 @@ class Sweep:
     def begin(self, first: Record) -> None:
         """Add derivatives by the initial anchors of the first step, the positions of contactors before it (collective)."""
         problem = self.problem
-        if not any(pair.frictional for pair in problem.pairs):
+        if not any(pair.friction is not None for pair in problem.pairs):
             return
         Memory.put_back(first.before, problem)
         slopes = anchor_slopes_of(problem)
@@ -329,7 +329,7 @@ def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) ->
 
 def anchor_slopes_of(problem: UnitedProblem) -> list[AnchorSlopes | None]:
     """Derivatives by anchors in the present trial states, None without friction (collective)."""
-    return [AnchorSlopes(pair, c.name) if pair.frictional else None for pair, c in zip(problem.pairs, problem.contacts)]
+    return [AnchorSlopes(pair, c.name) if pair.friction is not None else None for pair, c in zip(problem.pairs, problem.contacts)]
 
 
 def _back(

@@ -18,7 +18,8 @@ def state_of(problem: Any) -> State:
     functions = own | {"stiffness": stiffness}
     carried = {name: fem.Function(f.function_space) for name, f in own.items()}
     for i, pair in enumerate(problem.pairs, 1):
-        functions |= {f"{what} of contact {i}": f for what, f in pair.functions.items()}
+        if pair.tie is not None:
+            functions[f"displacement it was tied at of contact {i}"] = pair.tie.at
     ramped = problem.dynamics is None
     if problem.dynamics is None:
         for what, fields in (("load start", starts), ("released", carried)):

@@ -64,7 +64,7 @@ def refuse_passages(
         TunnellingError: names the deepest such contactor of the first rank that has one.
     """
     du = config.displacement - config.of(start)
-    looked_at = [(pair, motion) for pair, motion in zip(pairs, motions) if pair.sliding == "finite"]
+    looked_at = [(pair, motion) for pair, motion in zip(pairs, motions) if pair.discretisation.traits.sliding == "finite"]
     ways = [_ways(pair, du, motion) for pair, motion in looked_at]
     # for each contact: the longest displacements of both sides, the sum of the target's displacements and their number
     mine = np.array(
@@ -142,7 +142,7 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     length = np.linalg.norm(way, axis=1) + max(comm.allgather(np.linalg.norm(moved, axis=2).max(initial=0.0)))
     reach = PASSAGE_DEPTH * target.stride
     # only contactors that the target could have met
-    p = pair.projection
+    p = pair.kinematics.projection
     follow = target.behind_others if _listed(target) else ~pair.tied
     near = np.flatnonzero((length > target.stride) & follow & (np.linalg.norm(points - p.foot, axis=1) <= length + reach))
     depth = np.zeros(len(points))
@@ -235,7 +235,7 @@ def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array
     if any(pair.config.comm.allgather(len(new))):
         with pair.config.at(start):
             x = pair.points[new]
-            nearest, touched = target.project(x, new), target.project_on(x, pair.projection.facet[new])
+            nearest, touched = target.project(x, new), target.project_on(x, pair.kinematics.projection.facet[new])
         behind[new] = np.where(nearest.gap >= 0.0, -touched.gap, 0.0)
         outward, away = target.outward(nearest), x - nearest.foot
         beside = np.linalg.norm(away - _dot(away, outward)[:, None] * outward, axis=1) > PASSAGE_DEPTH * target.stride
@@ -287,7 +287,7 @@ def _through_surface(pair: Interface, way: Array, motion: Motion | None, longest
         p = target.project(x)
         if k == 0:
             new = active & ~pair.committed.active & (p.gap >= 0.0)
-            behind[new] = np.einsum("ng,ng->n", end - x, pair.projection.normal)[new]
+            behind[new] = np.einsum("ng,ng->n", end - x, pair.kinematics.projection.normal)[new]
         # at the end contactors may be on a face up to rounding
         outside = (p.gap >= (-PASSAGE_DEPTH * target.stride if k == places else 0.0)) | (k == 0) | ((k == places) & active)
         passed = outside & (deepest > PASSAGE_DEPTH * target.stride) & ~pair.tied

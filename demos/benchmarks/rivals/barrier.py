@@ -127,7 +127,7 @@ class BarrierSystem(PushedSystem):
             gradient = self._potential.gradient(self._collisions, self._mesh, V)
             forces[self._nodes] -= np.asarray(gradient).reshape(-1, self.config.gdim)
         for pair, areas in zip(self.pairs, self._areas):
-            p = pair.projection
+            p = pair.kinematics.projection
             if not isinstance(pair.target, MeshTarget):
                 forces[pair.nodes] -= (areas * self._rigid(p.gap)[0])[:, None] * p.normal
             force = forces[pair.nodes]
@@ -158,9 +158,11 @@ class BarrierSystem(PushedSystem):
             values.append(H.data)
         for pair, areas in zip(self.pairs, self._areas):
             if not isinstance(pair.target, MeshTarget):
-                n = pair.projection.normal
+                n = pair.kinematics.projection.normal
                 blocks = (
-                    (areas * np.maximum(self._rigid(pair.projection.gap)[1], 0.0))[:, None, None] * n[:, :, None] * n[:, None, :]
+                    (areas * np.maximum(self._rigid(pair.kinematics.projection.gap)[1], 0.0))[:, None, None]
+                    * n[:, :, None]
+                    * n[:, None, :]
                 )
                 dofs = pair.nodes[:, None] * g + np.arange(g)
                 rows.append(np.broadcast_to(dofs[:, :, None], blocks.shape).ravel())
@@ -182,11 +184,11 @@ class BarrierSystem(PushedSystem):
         self._squeezes = 0
         for pair in self.pairs:
             self.place()
-            gap = np.where(pair.off, np.inf, pair.projection.gap)
+            gap = np.where(pair.off, np.inf, pair.kinematics.projection.gap)
             near = gap.min(initial=np.inf)
             if near < TOO_NEAR * self.distance:
                 body, _ = find_bodies(self.config)
-                normal = pair.projection.normal[gap.argmin()]
+                normal = pair.kinematics.projection.normal[gap.argmin()]
                 self.config.displacement[body == body[pair.nodes[0]]] += (0.5 * self.distance - near) * normal
         self.place()
 

@@ -70,7 +70,7 @@ class LagrangeSystem(BodySystem):
         equations = UnitingEquations.join([pair.equations().P for pair in self.pairs], self.config.gdim)
         equations = equations.select(equations.active)
         self._c = self.config.vector(self.bodies.prescribed)
-        if curvature is None and not any(pair.sliding == "finite" for pair in self.pairs):
+        if curvature is None and not any(pair.discretisation.traits.sliding == "finite" for pair in self.pairs):
             made_of = (
                 self.bodies.tangent.number,
                 equations.node.tobytes(),

@@ -103,7 +103,7 @@ class NodePoints:
 
     def project(self) -> Projection:
         """Where the points stand; the pair knows (collective)."""
-        return self.pair.projection
+        return self.pair.kinematics.projection
 
     def begin(self) -> None:
         """Begin a step."""
@@ -127,14 +127,14 @@ class SurfacePoints:
     def project(self) -> Projection:
         """Where the points stand (collective)."""
         points = np.einsum("ka,kag->kg", self.shape, self.pair.config.x[self.nodes])
-        if self.pair.sliding == "finite" or self._anchor is None:
+        if self.pair.discretisation.traits.sliding == "finite" or self._anchor is None:
             projection = self._anchor = self.pair.target.project(points)
             return projection
         return self.pair.target.follow(points, self._anchor)
 
     def begin(self) -> None:
         """Begin a step: small sliding looks for its feet anew."""
-        if self.pair.sliding == "small":
+        if self.pair.discretisation.traits.sliding == "small":
             self._anchor = None
 
 
@@ -305,7 +305,7 @@ class PenaltySystem(PushedSystem):
             for pair in self.pairs:
                 if isinstance(pair.target, MeshTarget):
                     pair.target.averaged = True
-        sliding = any(pair.sliding == "finite" for pair in self.pairs)
+        sliding = any(pair.discretisation.traits.sliding == "finite" for pair in self.pairs)
         on = hash(tuple((s.force > 0).tobytes() for s in self._springs))
         made_of = self.comm.allgather((self.bodies.tangent.number, on))
         if self._A is None or sliding or self._frictional or made_of != self.made_of:
@@ -332,7 +332,7 @@ class PenaltySystem(PushedSystem):
         slope = (weights[i, :, None] * s.projection.normal[i, None, :]).reshape(len(i), size)
         blocks = self._stiffness_of_springs * s.area[i, None, None] * np.einsum("ki,kj->kij", slope, slope)
         finite = isinstance(s.projection, FacetProjection) or s.projection.nodes.shape[1] == 0
-        if finite and self.consistent_tangent and any(pair.sliding == "finite" for pair in self.pairs):
+        if finite and self.consistent_tangent and any(pair.discretisation.traits.sliding == "finite" for pair in self.pairs):
             blocks -= s.force[i, None, None] * self._shape_operator(s, i)
         if s.friction:
             blocks += self._friction_blocks(s, i, weights[i], mu)

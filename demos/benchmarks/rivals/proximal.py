@@ -52,7 +52,7 @@ class ProximalSystem(PenaltySystem):
     def __init__(self, *args: Any, tags: list[Any], stiffness: float, scale: float, **options: Any):
         super().__init__(*args, tags=tags, stiffness=stiffness, points=NodePoints, **options)
         self._first, self._cap = stiffness, STIFFEST * scale
-        if any(pair.sliding == "finite" and self.config.degree > 1 for pair in self.pairs):
+        if any(pair.discretisation.traits.sliding == "finite" and self.config.degree > 1 for pair in self.pairs):
             raise SpaceError("areas of contactors that are zero or negative: take degree 1, or sliding='fixed'")
         areas = np.concatenate([points.area for points in self._points])
         sums = reduced(self.comm, np.array([areas.sum(), float(len(areas))]))

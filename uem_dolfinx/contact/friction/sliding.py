@@ -91,10 +91,10 @@ class Sliding:
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
 
-    def place(self, kinematics: Kinematics, state: FrictionState) -> None:
+    def place(self, kinematics: Kinematics, state: PairState) -> None:
         """Find the anchors, or the relative motions of contactors, in the current configuration (collective)."""
         if self.discretisation.traits.pointwise:
-            self._anchors, self._held_by = anchors_of(state, self.discretisation.target, self.config.gdim == 3)
+            self._anchors, self._held_by = anchors_of(_of(state), self.discretisation.target, self.config.gdim == 3)
         elif self._last is None:
             here = self.config.x[: self.config.n_owned].copy()
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion)
@@ -418,9 +418,11 @@ class Sliding:
         tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope, end) * share, _of(state).tau)
         return tau, start, end, stick_slip.work(_of(committed).tau, tau, start, end, self.frame.cornered)
 
-    def forget(self) -> None:
-        """Discard the reference of slip, after a change of the state from which the step begins."""
+    def begin_from(self, state: PairState) -> None:
+        """Begin a step from a state: discard the reference of slip, and increase gaps by the wear depth (collective)."""
         self._last = None
+        if self.wear is not None:
+            self.wear.apply(state)
 
     def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
         """Relative motions since the last step, per unit of friction at its start and at its end ``(n, gdim)`` (collective)."""

@@ -83,7 +83,7 @@ class BodiesContact(GeneralPart):
 
     def opposite(self, skin: Skin) -> Ints:
         """Numbers of the bodies opposite to contactors ``(n,)``, -1 for no body (collective)."""
-        return np.asarray(skin.values_at(self.on_skin(self.pair.projection.facet), skin.body))
+        return np.asarray(skin.values_at(self.on_skin(self.pair.kinematics.projection.facet), skin.body))
 
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
         """Values by the body opposite to contactors ``(n,)``; None if they do not depend on it (collective)."""
@@ -136,7 +136,7 @@ class AmongContact(BodiesContact):
         (across, along), pair = super().pressing(), self.pair
         if not pair.asked:
             return across, along
-        received, normal, spread = self._received(), pair.projection.normal, pair.discretisation.spread
+        received, normal, spread = self._received(), pair.kinematics.projection.normal, pair.discretisation.spread
         pressing = np.einsum("ng,ng->n", received, normal)
         sliding = received - pressing[:, None] * normal
         return across + spread(pressing), along + np.column_stack([spread(part) for part in sliding.T])
@@ -144,7 +144,7 @@ class AmongContact(BodiesContact):
     def leads(self) -> Bools:
         """See ``ContactResults``: contactors of bodies that follow in the order; not edge nodes in the opposite direction (collective)."""
         skin, place = self._skin, self._neighbours.place
-        body = skin.values_at(self.pair.projection.facet, skin.body)
+        body = skin.values_at(self.pair.kinematics.projection.facet, skin.body)
         return np.asarray((body >= 0) & (place[skin.body_of_node[self.pair.nodes]] <= place[body]))
 
     def edges_that_meet(self) -> Meeting:
@@ -172,7 +172,7 @@ class AmongContact(BodiesContact):
         place = np.full(config.n_owned, -1)
         place[self.pair.nodes[active]] = active
         body = np.full(len(place), -1)
-        body[self.pair.nodes[active]] = skin.values_at(self.pair.projection.facet[active], skin.body)
+        body[self.pair.nodes[active]] = skin.values_at(self.pair.kinematics.projection.facet[active], skin.body)
         counts = (body[there] == arrived[:, 0]) & ((arrived[:, 1] > 0) | skin.corners[there])
         return sums_of_rows(place[there][counts], arrived[counts, 2:], len(self.pair.nodes))
 

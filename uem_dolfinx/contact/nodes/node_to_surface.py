@@ -216,8 +216,10 @@ class NodalKinematics(PlacedOnTarget):
 
     @cached_property
     def ends(self) -> Ends:
-        """Open ends, which can hold contactors; see ``Kinematics``."""
-        return Ends(self.projection, self.of.thickness, self.of.ends_hold, out=self.out)
+        """Open ends, which can hold contactors, except with two-pass contact, where the end itself touches; see ``Kinematics``."""
+        s = self.of.setting
+        holds = np.logical_and(self.of.ends_hold, ~s.mutual[s.label])
+        return Ends(self.projection, self.of.thickness, holds, out=self.out)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

@@ -43,8 +43,9 @@ class AdhesiveInterface(SofteningInterface):
         self.trial = self.committed = replace(self.committed, cohesion=np.zeros((len(self.nodes), 2)))
         super().activate_touching()
 
-    def _project(self) -> None:
-        super()._project()
+    def project(self) -> None:
+        """See ``Interface``; the law gives the attraction there (collective)."""
+        super().project()
         if self.trial.cohesion is None or not self.asked:
             self._pull = self._stiffness = np.zeros(len(self.nodes))
             return

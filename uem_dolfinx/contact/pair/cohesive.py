@@ -114,14 +114,15 @@ class CohesiveInterface(SofteningInterface):
         n, g = len(self.nodes), self.config.gdim
         state = np.zeros((n, PERMANENT + 2 * g))
         state[:, :AT] = np.where(self._bonds.bonded, 0.0, 1.0)[:, None]
-        state[:, AT], state[:, -g:] = self._contact._at, self.projection.normal
+        state[:, AT], state[:, -g:] = self._contact._at, self.kinematics.projection.normal
         self.trial = self.committed = replace(self.committed, cohesion=state)
         self._rub()
 
     # -- tractions -------------------------------------------------------------------------------------------------------
 
-    def _project(self) -> None:
-        super()._project()
+    def project(self) -> None:
+        """See ``Interface``; the law gives the tractions of the bonds there (collective)."""
+        super().project()
         before = self.committed.cohesion
         if before is None or self._bonds.rows is None:
             return
@@ -199,15 +200,10 @@ class CohesiveInterface(SofteningInterface):
         if self.friction is not None:
             super().set_friction(self.friction.limits.law, self._rubbing(self._mu))
 
-    def set_friction(self, law: FrictionLaw, value: Array) -> None:
+    def set_friction(self, law: FrictionLaw, value: Array, known: bool = False) -> None:
         """See ``Interface``; ``value (n,)`` is that of surfaces without cohesion (collective)."""
         self._mu = value
-        super().set_friction(law, self._rubbing(value))
-
-    def know_friction(self, law: FrictionLaw, value: Array) -> None:
-        """See ``Readings``; ``value (n,)`` is that of surfaces without cohesion (collective)."""
-        self._mu = value
-        super().know_friction(law, self._rubbing(value))
+        super().set_friction(law, self._rubbing(value), known)
 
     # -- from step to step -----------------------------------------------------------------------------------------------
 
@@ -215,7 +211,7 @@ class CohesiveInterface(SofteningInterface):
         """See ``Interface``; bonds open along the normals of this state in the next step (collective)."""
         if self.trial.cohesion is not None:
             g = self.config.gdim
-            told = np.column_stack([self.trial.cohesion[:, :-g], self.projection.normal])
+            told = np.column_stack([self.trial.cohesion[:, :-g], self.kinematics.projection.normal])
             self.trial, self._first = replace(self.trial, cohesion=told), None
         super().commit()
         self._rub()

@@ -30,10 +30,6 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.ties.tie import Tie
     from uem_dolfinx.geometry.rigid import Motion
 
-#: Contactors this part of the model's size from where they belong are there.
-#: [derived; the model's size; test_system.py::test_the_normal_return]
-POSITION_ROUNDING = 4.0 * np.finfo(float).eps
-
 
 class Interface(Readings):
     """Contactors against one target.
@@ -45,17 +41,13 @@ class Interface(Readings):
         friction: tangential part; None without friction.
         tie: permanent tie of contactors, in addition to contact; None without a tie.
         name: for messages.
-        sliding: ``"finite"``, ``"small"`` or ``"fixed"``.
         max_penetration: bound on the initial penetration, a length.
-        thickness: thickness of the target's body, a length.
 
     Attributes:
         trial: state of the present iteration.
         committed: state of the last step.
         kinematics: of the contactors, for the trial state; available after ``project``.
         initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
-        label: number of the contact of each contactor, among ``members`` ``(n,)``.
-        mutual: contacts whose contactors and target follow each other (two-pass) ``(n_contacts,)``.
         heats: heat flow, one object per conductance.
     """
 
@@ -70,33 +62,25 @@ class Interface(Readings):
         tie: Tie | None = None,
         *,
         name: str,
-        sliding: str,
         max_penetration: float,
-        thickness: float = np.inf,
     ):
         self.config, self.nodes, self.discretisation, self.friction, self.tie = config, nodes, discretisation, friction, tie
-        self.name, self.sliding, self.max_penetration, self.thickness = name, sliding, max_penetration, thickness
+        self.name, self.max_penetration, self.initial_overlap = name, max_penetration, 0.0
         state = PairState.initial(n := len(nodes), g := config.gdim)
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
         self.trial = self.committed = replace(state, friction=along, bond=bond)
         self.heats: list[Heat] = []
-        self.label: Ints = np.zeros(n, dtype=np.int64)
-        self.initial_overlap, self.mutual = 0.0, np.zeros(1, dtype=bool)
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
 
+    @timed("projection")
     def project(self) -> None:
         """Project the contactors onto the target in the current configuration (collective).
 
         Raises:
             NotFiniteError: if the target's functions return values that are not finite.
         """
-        if self.asked or not self.far:
-            self._project()
-
-    @timed("projection")
-    def _project(self) -> None:
-        if self.tie is not None and not self.tie.begin_placement():
+        if (self.far and not self.asked) or (self.tie is not None and not self.tie.begin_placement()):
             return
         known = hasattr(self, "kinematics")
         self.kinematics = self.discretisation.place(self.points, self.trial)
@@ -105,61 +89,47 @@ class Interface(Readings):
             heat = np.zeros((len(none), united)) if united else None
             self.set_forces(Traction(none, none, np.zeros(self.points.shape), heat=heat))
             return
-        p = self.projection
+        p = self.kinematics.projection
         finite, error = np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1), None
         if not finite.all():
             i = int(np.argmin(finite))
             error = NotFiniteError(
-                f"{self.name_at(i)}: gap {p.gap[i]}, normal {p.normal[i]} at {self.config.describe(int(self.nodes[i]))}: "
+                f"{name_at(self, i)}: gap {p.gap[i]}, normal {p.normal[i]} at {self.config.describe(int(self.nodes[i]))}: "
                 "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
             )
         agree(self.config.comm, error)
-        self._place_friction()
-
-    def _place_friction(self) -> None:
         if self.friction is not None:
-            assert self.trial.friction is not None
-            self.friction.place(self.kinematics, self.trial.friction)
+            self.friction.place(self.kinematics, self.trial)
 
-    def look(self) -> None:
-        """Project contactors that were skipped because the surfaces are separated (collective)."""
-        if self.far:
-            self._search()
-            self.project()
-
-    def _search(self) -> None:
-        """Search for all contactors from the next placement on."""
+    def search(self) -> None:
+        """Search for all contactors from the next placement on, far apart or not (collective)."""
         far = self.discretisation.setting.far
         if far.any():
             self.discretisation.set(far=np.zeros_like(far))
 
-    def return_vectors(self) -> Array:
-        """Displacements of the normal return [UEM, 4.2], zero where active contactors are on the target to rounding ``(n, gdim)``."""
-        correction = np.zeros(self.points.shape)
-        if self.discretisation.traits.at_feet:
-            correction = self.kinematics.gap_rows.normal_return(self.trial.active)
-        if self.friction is not None:
-            correction = correction + self.friction.return_vectors(self.trial)
-        # surfaces that follow each other would both close the same gap
-        correction[(np.linalg.norm(correction, axis=1) <= POSITION_ROUNDING * self.config.size) | self.mutual[self.label]] = 0.0
-        return correction
-
     # -- activation and release ------------------------------------------------------------------------------------------
 
-    def set_friction(self, law: FrictionLaw, value: Array) -> None:
-        """Set a friction law and values of its parameter ``(n,)``, between two steps (collective)."""
-        assert self.friction is not None
-        self.trial = self.committed = self.friction.other_law(self.committed, law, value)
+    def set_friction(self, law: FrictionLaw, value: Array, known: bool = False) -> None:
+        """Set a friction law and values of its parameter ``(n,)``, between two steps (collective).
 
-    def _set_active(self, state: PairState) -> None:
+        ``known``: whether the committed state belongs to them; otherwise contactors that become frictional stick where they are.
+        """
+        assert self.friction is not None
+        if known:
+            self.friction.set(law, value)
+        else:
+            self.trial = self.committed = self.friction.other_law(self.committed, law, value)
+
+    def set_active(self, state: PairState) -> None:
         """Set the trial state, with another active set."""
         self.trial = state if self.friction is None else self.friction.come_and_go(state, self.trial.active)
 
     def activate_touching(self) -> None:
         """Activate contactors that initially touch without force; with friction they stick (collective)."""
         anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
-        state = active_set.touching(self.trial, self.gap, self.config.size, ~self.off & self.movable)
-        self._set_active(replace(state, at_end=self._at_end(self.trial)))
+        k = self.kinematics
+        state = active_set.touching(self.trial, k.gap, self.config.size, ~self.off & k.movable)
+        self.set_active(replace(state, at_end=k.ends.held(self.trial)))
         if anchored is not None and self.trial.friction is not None:
             self.trial = replace(self.trial, friction=replace(anchored, stick=self.trial.friction.stick))
         # a first step that fails and is cut starts again from this state
@@ -167,22 +137,12 @@ class Interface(Readings):
         if anchored is not None:
             self.project()
 
-    def bar_returned(self) -> int:
-        """Exclude contactors that had sunk past the target's end and re-entered in this step; return their number (collective)."""
-        came = self.trial.active & ~self.committed.active & self.committed.passed
-        self.committed = replace(self.committed, barred=self.committed.barred | came)
-        return int(reduced(self.config.comm, int(came.sum())))
-
-    def _at_end(self, state: PairState) -> Bools:
-        """Contactors held by an end of the target in the next step ``(n,)``; none with two-pass contact, where the end itself touches."""
-        return self.kinematics.ends.held(state) & ~self.mutual[self.label]
-
     def follow(self) -> bool:
         """Release contactors past an end, follow the others from facet to facet (collective): whether an equation changes on this rank."""
         off, before = self.off, self.kinematics
         gone = bool((self.trial.active & off).any())
         self.kinematics, state = before.follow(self.trial, off)
-        self._set_active(state)
+        self.set_active(state)
         moved = self.kinematics is not before
         if moved and self.friction is not None:
             self.friction.replace(self.kinematics)
@@ -210,7 +170,7 @@ class Interface(Readings):
             du: increment of the owned nodes used for the prediction ``(n_owned, gdim)``; None for the current configuration.
         """
         off = self.off
-        if swept and self.thickness < np.inf:
+        if swept and self.kinematics.ends.thickness < np.inf:
             off = off | (self.trial.at_end & self.trial.passed)
         # a contactor is open if its equation was dropped as redundant and its gap is positive
         apart = self.trial.redundant & (gap > max(gap_rounding, active_set.TOUCHING * self.config.size))
@@ -218,7 +178,14 @@ class Interface(Readings):
         pulled = np.where(self.trial.in_corner, 0.0, seen.lam)
         rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
         violated = active_set.find_violations(
-            self.trial, gap, pulled, off, self.movable & ~apart, stiffness, force_rounding=force_rounding, gap_rounding=rounding
+            self.trial,
+            gap,
+            pulled,
+            off,
+            self.kinematics.movable & ~apart,
+            stiffness,
+            force_rounding=force_rounding,
+            gap_rounding=rounding,
         )
         if self.friction is None:
             return violated
@@ -229,7 +196,7 @@ class Interface(Readings):
 
         def enter(state: PairState) -> PairState:
             self.trial = state
-            self._set_active(active_set.exchange(state, violated))
+            self.set_active(active_set.exchange(state, violated))
             return self.trial
 
         if self.friction is None:
@@ -237,47 +204,12 @@ class Interface(Readings):
         else:
             self.trial = self.friction.exchange(violated, self.trial, self.committed, self.kinematics, enter)
 
-    def calm(self, which: Bools) -> bool:
-        """Set averaged normals in this step for contactors of ``which (n,)`` that alternate between facets: whether there are any."""
-        from uem_dolfinx.contact.nodes.concave_edges import HOLD_AFTER, MOST_CHANGES
-
-        changes = self.trial.changes
-        some = which & self.trial.active & (changes >= HOLD_AFTER) & (changes < MOST_CHANGES)
-        self.trial = replace(self.trial, changes=np.where(some, MOST_CHANGES, changes))
-        return bool(some.any())
-
-    def meet(self, normals: Array) -> None:
-        """Take the normals of other contacts with rigid surfaces at the same contactors ``(n, k, gdim)`` (collective)."""
-        if self.friction is not None:
-            self.friction.meet(self.kinematics, normals)
-
-    # -- bodies that only contact holds ----------------------------------------------------------------------------------
-
     @property
-    def _ahead(self) -> Ints:
-        """Contactors in front of the target that are not active."""
-        return np.flatnonzero(~self.trial.active & ~self.off & self.movable)
-
-    @property
-    def approach(self) -> UnitingEquations:
-        """Normal equations of inactive contactors in front of the target."""
-        rows = self.kinematics.gap_rows.select(self._ahead, np.ones(len(self.nodes), bool))
-        return rows.rows.select(rows.normal)
-
-    def activate_closing(self, closing: Bools) -> bool:
-        """Activate the contactors of ``approach`` that are ``closing`` and touch (collective): whether there are any."""
-        i = self._ahead
-        now = i[closing & (self.gap[i] <= active_set.TOUCHING * self.config.size)]
-        active = self.trial.active.copy()
-        active[now] = True
-        self._set_active(replace(self.trial, active=active))
-        return bool(reduced(self.config.comm, len(now)))
-
-    def release_apart(self) -> None:
-        """Without friction, release contactors that rigid motions have separated from the target (collective)."""
-        if not self.frictional:
-            apart = self.trial.active & (self.gap > active_set.TOUCHING * self.config.size)
-            self._set_active(replace(self.trial, active=self.trial.active & ~apart))
+    def approach(self) -> tuple[Ints, UnitingEquations]:
+        """Inactive contactors in front of the target, and their normal equations; negative numbers where no activation is needed."""
+        ahead = np.flatnonzero(~self.trial.active & ~self.off & self.kinematics.movable)
+        rows = self.kinematics.gap_rows.select(ahead, np.ones(len(self.nodes), bool))
+        return ahead, rows.rows.select(rows.normal)
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 
@@ -338,7 +270,8 @@ class Interface(Readings):
     def curvature(self) -> list[tuple[Ints, Array]]:
         """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
         along = None if self.friction is None else self.friction.along(self.trial, self.kinematics)
-        parts = self.kinematics.curvature(self.trial, along)
+        k = self.kinematics
+        parts = k.curvature(self.trial) if along is None else k.curvature(self.trial, along)
         return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
     def turn(self, stiffness: Array) -> None:
@@ -355,7 +288,9 @@ class Interface(Readings):
     def unite(self, which: Bools | None = None) -> None:
         """Tie contactors to the target permanently, between two steps, see ``Tie``; call ``project`` afterwards (collective)."""
         assert self.tie is not None
-        self.committed = self.tie.unite(self.committed, self.projection, self._past_end, which)
+        self.committed = self.tie.unite(
+            self.committed, self.kinematics.projection, self.kinematics.ends.excluded(self.trial), which
+        )
         self.restore()
 
     def commit(self) -> None:
@@ -364,22 +299,18 @@ class Interface(Readings):
             return
         if self.friction is not None:
             if not self.asked:
-                self._place_friction()
+                self.friction.place(self.kinematics, self.trial)
             self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
-        inside = self.projection.gap < 0
+        inside, ends = self.kinematics.projection.gap < 0, self.kinematics.ends
         self.trial = replace(self.trial, barred=self.trial.barred & inside)
         passed = self.off | (self.trial.passed & inside)
         reserved = self.trial.reserved & bool(self.trial.active.any())
         fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed, reserved=reserved)
-        self.committed = replace(fresh, at_end=self._at_end(fresh))
+        self.committed = replace(fresh, at_end=ends.held(fresh))
         self.restore()
         self.discretisation.commit()
-        self._wear()
-
-    def _wear(self) -> None:
-        """Increase gaps by the wear depth of the committed state (collective)."""
-        if self.friction is not None and self.friction.wear is not None:
-            self.friction.wear.apply(self.committed)
+        if self.friction is not None:
+            self.friction.begin_from(self.committed)
 
     def restore(self) -> None:
         """Go back to the committed state; call ``project`` afterwards."""
@@ -392,18 +323,22 @@ class Interface(Readings):
         # contactors that have been tied since then remain tied
         self.committed = state if self.tie is None else self.tie.untouched(state)
         # an earlier state may bring the surfaces together
-        self._search()
+        self.search()
         self.discretisation.commit()
         if self.friction is not None:
-            self.friction.forget()
+            self.friction.begin_from(self.committed)
         self.restore()
-        self._wear()
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
         """Restore a state from ``to_checkpoint``; call ``project`` afterwards (collective)."""
         if self.tie is not None:
-            self.tie.from_checkpoint(kept, self._past_end)
+            self.tie.from_checkpoint(kept, self.kinematics.ends.excluded(self.trial))
         self.remember(PairState.from_checkpoint(kept, self.target.facets_of))
+
+
+def name_at(pair: Interface, i: int) -> str:
+    """Name of the contact of a contactor."""
+    return str(pair.members[pair.discretisation.setting.label[i]].name)
 
 
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:

@@ -8,8 +8,6 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 
-import numpy as np
-
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.joined_nodes import JoinedNodes, JoinedSliding
 from uem_dolfinx.contact.pair.member import Member
@@ -35,12 +33,8 @@ class JoinedInterface(Interface):
         nodal = JoinedNodes(ties)  # type: ignore[arg-type]
         sliding = [pair.friction for pair in own if pair.friction is not None]
         friction = JoinedSliding(sliding, nodal) if sliding else None
-        super().__init__(
-            first.config, nodal.nodes, nodal, friction, name=first.name, sliding=first.sliding,
-            max_penetration=first.max_penetration, thickness=first.thickness,
-        )  # fmt: skip
+        super().__init__(first.config, nodal.nodes, nodal, friction, name=first.name, max_penetration=first.max_penetration)
         self.own = list(own)
-        self.label, self.mutual = nodal.label, np.zeros(len(own), dtype=bool)
         self.rows_of = nodal.rows_of
         self._members: list[weakref.ref[Member]] = []
         here, surface = nodal.target.here, nodal.surface_of
@@ -70,7 +64,7 @@ class JoinedInterface(Interface):
 
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""
-        before, far = self.committed, self.discretisation.setting.far[self.label]
+        before, far = self.committed, self.discretisation.setting.far[self.discretisation.label]
         super().commit()
         if far.any():
             self.trial = self.committed = with_rows(self.committed, far, rows(before, far))

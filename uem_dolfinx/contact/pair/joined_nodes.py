@@ -51,7 +51,8 @@ class JoinedNodes(NodeToSurface):
         how: dict[str, Any] = {"free": first.setting.free, "sliding": first.sliding, "thickness": first.thickness}
         super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
         self._own = own
-        self.set(far=np.zeros(len(own), dtype=bool))
+        none = np.zeros(len(own), dtype=bool)
+        self.set(far=none, mutual=none, label=self.label)
         if any(one.offset is not None for one in own):
             self.set(offset=np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
 

@@ -30,8 +30,8 @@ class Member(Interface):
     def __init__(self, whole: Any, k: int, own: Interface):
         self.joined, self._k, self._rows = whole, k, whole.rows_of[k]
         self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
-        self.name, self.sliding, self.max_penetration, self.thickness = own.name, own.sliding, own.max_penetration, own.thickness
-        self.tie, self.heats, self.initial_overlap, self.label = None, [], own.initial_overlap, own.label
+        self.name, self.max_penetration, self.tie, self.heats = own.name, own.max_penetration, None, []
+        self.initial_overlap = own.initial_overlap
         self._known: tuple[Kinematics, PairState, Kinematics] | None = None
 
     @property
@@ -67,7 +67,7 @@ class Member(Interface):
     def largest_gap_here(self) -> float:
         """Largest gap of an active contactor of this rank, or distance from its anchor, a length."""
         whole = self.joined
-        here = float(np.abs(self.gap[self.united & ~whole.trial.redundant[self._rows]]).max(initial=0.0))
+        here = float(np.abs(self.kinematics.gap[self.united & ~whole.trial.redundant[self._rows]]).max(initial=0.0))
         if whole.friction is None:
             return here
         return max(here, float(whole.friction.distances(whole.trial)[self._rows].max(initial=0.0)))
@@ -83,7 +83,8 @@ class Member(Interface):
         """Whether it is skipped, since the surfaces are separated."""
         return bool(self.joined.discretisation.setting.far[self._k])
 
-    def _search(self) -> None:
+    def search(self) -> None:
+        """Search for its contactors from the next placement on (collective)."""
         if self.far:
             far = self.joined.discretisation.setting.far.copy()
             far[self._k] = False
@@ -139,18 +140,10 @@ class Member(Interface):
         others = any(pair.discretisation.setting.offset is not None for pair in self.joined.own)
         nodal.set(offset=every if others else None)
 
-    def know_friction(self, law: FrictionLaw, value: Array) -> None:
-        """Set the friction law and parameter values ``(n,)`` of the committed state (collective)."""
-        assert self.friction is not None and self.joined.friction is not None
-        self.friction.set(law, value)
-        self.joined.friction.set(*self._friction_of_all())
-
-    def set_friction(self, law: FrictionLaw, value: Array) -> None:
-        """Set a friction law and values of its parameter ``(n,)``, between two steps (collective)."""
+    def set_friction(self, law: FrictionLaw, value: Array, known: bool = False) -> None:
+        """See ``Interface`` (collective)."""
         assert self.friction is not None
         self.friction.set(law, value)
-        self.joined.set_friction(*self._friction_of_all())
-
-    def _friction_of_all(self) -> tuple[FrictionLaw, Array]:
         own = [pair.friction for pair in self.joined.own if pair.friction is not None]
-        return JoinedLaw([one.limits.law for one in own], self.joined.label), np.concatenate([one.value for one in own])
+        every = JoinedLaw([one.limits.law for one in own], self.joined.discretisation.label)
+        self.joined.set_friction(every, np.concatenate([one.value for one in own]), known)

@@ -116,8 +116,9 @@ class SoftInterface(Interface):
 
     # -- placement and forces --------------------------------------------------------------------------------------------
 
-    def _project(self) -> None:
-        super()._project()
+    def project(self) -> None:
+        """See ``Interface``; the law gives the forces of the gaps there (collective)."""
+        super().project()
         n, known = len(self.nodes), self.trial.law_gap
         if not self._acts or known is None:
             self._multipliers, self._stiffness, self._holds = *np.zeros((2, n)), np.zeros(n, dtype=bool)
@@ -272,11 +273,6 @@ class SoftInterface(Interface):
         """Contactors under pressure ``(n,)``."""
         return self.trial.lam > 0.0
 
-    @property
-    def movable(self) -> Bools:
-        """All of them: prescribed contactors press as others do ``(n,)``."""
-        return np.ones(len(self.nodes), dtype=bool)
-
     def violated(self, gap: Array, *conditions: Any, **how: Any) -> Violations:
         """None."""
         return Violations.none(len(self.nodes))
@@ -284,7 +280,10 @@ class SoftInterface(Interface):
     def activate_touching(self) -> None:
         """None, but ends hold contactors that touch there, and pressures begin to act (collective)."""
         self.trial = self.committed = replace(
-            self.trial, at_end=self._at_end(self.trial), law_gap=np.full(len(self.nodes), np.inf), damping=self._damping(False)
+            self.trial,
+            at_end=self.kinematics.ends.held(self.trial),
+            law_gap=np.full(len(self.nodes), np.inf),
+            damping=self._damping(False),
         )
         self.project()
 
@@ -306,16 +305,13 @@ class SoftInterface(Interface):
         return replace(rows, kind=np.full(len(rows), -1), moved=None, resisted=held, crosswise=replace(rows.rows, active=held))
 
     @property
-    def approach(self) -> UnitingEquations:
-        """Rows of contactors that hold no body yet, with gaps above the gap at rest."""
+    def approach(self) -> tuple[Ints, UnitingEquations]:
+        """Rows of contactors that hold no body yet, with gaps above the gap at rest; gaps hold by themselves."""
         rows = self.kinematics.gap_rows
         ahead = rows.select(np.flatnonzero(~self._holds & ~self.off & self._stops), np.ones(len(self.nodes), dtype=bool))
         equations = ahead.rows.select(ahead.normal)
-        return replace(equations, gap=equations.gap - (self._law.law.rest * self._force)[ahead.contactor[ahead.normal]])
-
-    def activate_closing(self, closing: Bools) -> bool:
-        """Gaps hold by themselves."""
-        return False
+        rest = (self._law.law.rest * self._force)[ahead.contactor[ahead.normal]]
+        return np.full(len(rest), -1), replace(equations, gap=equations.gap - rest)
 
     def commit(self) -> None:
         """See ``Interface``; contactors that press have not passed an end, those that hold nothing follow their gaps."""

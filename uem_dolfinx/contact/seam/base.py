@@ -49,7 +49,8 @@ class OnTarget:
     ):  # fmt: skip
         self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
         self.contactor = contactor
-        self.setting = Setting(free, False, far=np.zeros(1, dtype=bool))
+        self.traits, none = self.traits._replace(sliding=sliding), np.zeros(1, dtype=bool)
+        self.setting = Setting(free, False, far=none, mutual=none, label=np.zeros(len(nodes), dtype=np.int64))
         self.set(free=free)
         self.anchor: Projection | None = None
         self.asked = True
@@ -61,7 +62,7 @@ class OnTarget:
         self._at_feet: tuple[Array, Array, Projection | None, Projection] | None = None
 
     def set(self, **changed: Any) -> None:
-        """Set ``free``, ``far``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
+        """Set parts of the setting but ``prescribed``; contactors must be placed again (collective)."""
         if "free" in changed:
             self.free = changed["free"][self.nodes]
             changed["prescribed"] = bool(reduced(self.config.comm, int(not self.free.all())))

@@ -62,6 +62,10 @@ class Ends:
             past = np.where(self.share >= 0.0, state.at_end & (self.share < COVERED_AGAIN), past)
         return past if self.out is None else past | self.out
 
+    def excluded(self, state: PairState) -> Bools:
+        """Contactors past an end, or excluded for another reason ``(n,)``."""
+        return self.past(state) | state.barred
+
     def held(self, state: PairState) -> Bools:
         """Contactors held by an end in the next step ``(n,)``: they first touch there, and have not slid away from it.
 

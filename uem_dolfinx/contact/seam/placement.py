@@ -345,6 +345,7 @@ class Traits(NamedTuple):
         chained: whether contactors may follow each other.
         two_pass: whether the target may be the contactor of another contact with these surfaces.
         order: number of the order of bodies that the rows of this and other contacts respect; -1 without an order.
+        sliding: ``"finite"``, ``"small"`` or ``"fixed"``.
     """
 
     at_feet: bool
@@ -352,6 +353,7 @@ class Traits(NamedTuple):
     chained: bool
     two_pass: bool
     order: int = -1
+    sliding: str = "finite"
 
 
 class Setting(NamedTuple):
@@ -361,6 +363,8 @@ class Setting(NamedTuple):
         free: components of all owned nodes without Dirichlet condition ``(n_owned, gdim)``.
         prescribed: whether any contactor on any rank has a Dirichlet condition.
         far: contacts whose surfaces are separated, so that their contactors are skipped, see ``solve.bodies.far_apart`` ``(n_contacts,)``.
+        mutual: contacts whose contactors and target follow each other (two-pass) ``(n_contacts,)``.
+        label: number of the contact of each contactor ``(n,)``.
         offset: heights minus gaps ``(n,)``; None without offset.
         cones: slopes of the contactors' cones of friction ``(n,)``; None without friction.
     """
@@ -368,6 +372,8 @@ class Setting(NamedTuple):
     free: Bools
     prescribed: bool
     far: Bools
+    mutual: Bools
+    label: Ints
     offset: Array | None = None
     cones: Array | None = None
 
@@ -395,7 +401,7 @@ class Discretisation(Protocol):
     asked: bool
 
     def set(self, **changed: Any) -> None:
-        """Set ``free``, ``far``, ``offset`` or ``cones`` of the setting; contactors must be placed again (collective)."""
+        """Set parts of the setting but ``prescribed``; contactors must be placed again (collective)."""
 
     def spread(self, values: Array) -> Array:
         """Integrals with non-negative functions, from integrals with the shape functions ``(n,)`` (collective)."""

@@ -232,9 +232,9 @@ class Heat:
     def passage(self) -> Passage:
         """Heat flow of the last placement (collective)."""
         # projections are identical on all ranks or on none
-        if self._passage is None or self._passage.projection is not self.pair.projection:
+        if self._passage is None or self._passage.projection is not self.pair.kinematics.projection:
             pair, current = self.pair, self._contact.measure == "current"
-            areas = self._contact.areas_facing(pair.nodes, pair.projection.normal, current)
+            areas = self._contact.areas_facing(pair.nodes, pair.kinematics.projection.normal, current)
             pressures, leads = pair.kinematics.pressure_map(current), self._contact.leads()
             self._passage = Passage(**vars(sides_of(pair)), areas=pressures.of_means(areas), force=pressures.force, leads=leads)
         return self._passage
@@ -246,7 +246,7 @@ class Heat:
     def _state(self) -> tuple[Array, ...]:
         """What h is a function of at the contactors ``(n,)``: pressures and gaps, one of the two zero, and temperatures (collective)."""
         closed = self.pair.united
-        p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self.pair.projection.gap, 0.0))
+        p, g = np.zeros(len(closed)), np.where(closed, 0.0, np.maximum(self.pair.kinematics.projection.gap, 0.0))
         if callable(self.law.h):
             # forces may be negative before the active set has converged, and at ties
             p = np.where(closed, np.maximum(self._contact.pressing()[0], 0.0) * self._per_area(), 0.0)
@@ -291,7 +291,7 @@ class Heat:
     def _moving(self) -> tuple[Bools, Bools]:
         """Contactors at which the pressure changes, those that are closed, and at which the gap changes, open ones ``(n,)`` each."""
         closed = self.pair.united
-        return closed, ~closed & (self.pair.projection.gap > 0.0)
+        return closed, ~closed & (self.pair.kinematics.projection.gap > 0.0)
 
     def jump(self) -> Array:
         """Temperature of contactors minus temperature of the target ``(n,)`` (collective)."""
@@ -365,7 +365,9 @@ class Heat:
     def _opening(self, *slopes: Array) -> tuple[Array, Terms]:
         """Derivatives of the power by gaps, from its ``slopes`` ``(n,)`` by ``_of_gaps``, and gaps as functions of the unknowns."""
         at, pair = self.passage, self.pair
-        return np.where(pair.united, 0.0, slopes[0]), Terms(at.row, at.node, at.jump[:, None] * pair.projection.normal[at.row])
+        return np.where(pair.united, 0.0, slopes[0]), Terms(
+            at.row, at.node, at.jump[:, None] * pair.kinematics.projection.normal[at.row]
+        )
 
     def by_pressures(self) -> Array:
         """Derivatives of the power by the pressures of closed contactors ``(n,)`` (collective)."""

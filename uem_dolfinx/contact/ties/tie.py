@@ -36,7 +36,6 @@ class Tie:
         nodes: owned contactor nodes ``(n,)``.
         discretisation: of the interface.
         name: for messages.
-        sliding: see ``Interface``.
         max_penetration: see ``Interface``.
         means: separate mortar discretisation for weighted means at the time of tying; None ties nodes.
         reach: largest distance from the target of contactors tied at the start, a length; None is a side of the target's facet.
@@ -56,13 +55,12 @@ class Tie:
         discretisation: Discretisation,
         *,
         name: str,
-        sliding: str,
         max_penetration: float,
         means: Mortar | None,
         reach: float | None,
     ):
         self.config, self.nodes, self.discretisation, self.target = config, nodes, discretisation, discretisation.target
-        self.name, self.sliding, self.max_penetration = name, sliding, max_penetration
+        self.name, self.max_penetration = name, max_penetration
         self.means, self._reach = means, reach
         self.rows: TiedRows | None = None
         self.tied: Bools = np.zeros(len(nodes), dtype=bool)
@@ -134,7 +132,7 @@ class Tie:
 
     def _make(self, which: Bools, off: Bools) -> None:
         """Make rows of contactors ``which (n,)`` at the displacement ``at``, or at the current one for a rigid target (collective)."""
-        config, nodes, kept = self.config, self.nodes, self.sliding != "finite"
+        config, nodes, kept = self.config, self.nodes, self.discretisation.traits.sliding != "finite"
         if not self.target.n_nodes:
             self._take_rows(to_surface(config, nodes, self.target, which), off)
             return

@@ -15,7 +15,7 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, name_at
 from uem_dolfinx.contact.seam.active_set import TOUCHING
 from uem_dolfinx.errors import ConflictError, ConvergenceError, OverdeterminedError, PenetrationError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -51,7 +51,7 @@ def check_initial(pair: Interface) -> None:
     Raises:
         PenetrationError: naming the deepest node of the first rank with such a node.
     """
-    gap = np.where(pair.off, np.inf, pair.projection.gap)
+    gap = np.where(pair.off, np.inf, pair.kinematics.projection.gap)
     error = None
     if len(pair.members) > 1:
         if reduced(pair.config.comm, bool((gap < -TOUCHING * pair.config.size).any()), op=MPI.LOR):
@@ -87,19 +87,19 @@ def check_prescribed(pair: Interface) -> None:
         OverdeterminedError: likewise, if the node or its target can move and only other contacts contradict its equation.
     """
     left_out = pair.trial.active & pair.trial.redundant
-    depth = -pair.projection.gap / pair.config.size
-    inside = ~pair.off & ((~pair.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
+    depth = -pair.kinematics.projection.gap / pair.config.size
+    inside = ~pair.off & ((~pair.kinematics.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
     error = None
     if inside.any():
-        i = int(np.argmin(np.where(inside, pair.projection.gap, np.inf)))
-        where = f"{pair.name_at(i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))}"
-        by = f"{-pair.projection.gap[i]:.4g} inside the target"
+        i = int(np.argmin(np.where(inside, pair.kinematics.projection.gap, np.inf)))
+        where = f"{name_at(pair, i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))}"
+        by = f"{-pair.kinematics.projection.gap[i]:.4g} inside the target"
         error = (
             OverdeterminedError(
                 f"{where} ends {by}: other contacts and conditions of these nodes leave no freedom for its equation; take shorter "
                 "steps or finer surfaces there, release a Dirichlet condition, or drop one of several contacts"
             )
-            if pair.movable[i]
+            if pair.kinematics.movable[i]
             else ConflictError(
                 f"{where} is prescribed to be {by}: a Dirichlet condition or another contact contradicts this one, and neither body can "
                 "move there; release the condition along the normal, or drop one of the contacts"
@@ -137,7 +137,7 @@ def check_signs(pairs: Sequence[Interface], rounding: Sequence[Array]) -> None:
         if (pull > np.maximum(least, PULLS * largest)).any():
             i = int(np.argmax(np.where(pull > least, pull, 0.0)))
             error = ConvergenceError(
-                f"{pair.name_at(i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))} pulls with {pull[i]:.3g}, where the "
+                f"{name_at(pair, i)}: the contactor at {pair.config.describe(int(pair.nodes[i]))} pulls with {pull[i]:.3g}, where the "
                 f"largest contact force is {largest:.3g}: no active set with forces of one sign was found; take smaller load steps, "
                 "or exchange the two surfaces"
             )
@@ -194,7 +194,7 @@ def sagging(pair: Interface) -> tuple[Bools, Array, Array]:
 
     ``(n,)`` each; all False for a rigid target.
     """
-    target, p = pair.target, pair.projection
+    target, p = pair.target, pair.kinematics.projection
     if not isinstance(target, MeshTarget) or not isinstance(p, FacetProjection):
         none = np.zeros(len(pair.nodes))
         return none > 0.0, none, none
@@ -209,7 +209,7 @@ def warn_of_sagging_facets(pair: Interface) -> None:
     """Warn of conforming surfaces whose clearance is below the sag of the target's straight facets (collective)."""
     if not isinstance(pair.target, MeshTarget):
         return
-    (close, sag, clearance), p = sagging(pair), pair.projection
+    (close, sag, clearance), p = sagging(pair), pair.kinematics.projection
     assert isinstance(p, FacetProjection)
     comm = pair.config.comm
     facets = len(set().union(*comm.allgather(set(p.facet[close].tolist()))))
@@ -254,7 +254,7 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
     Returns:
         Whether a warning was given.
     """
-    p = pair.projection
+    p = pair.kinematics.projection
     near = p.way_beyond < 0.5 * p.facet_size
     slipped = pair.off & ~before & near & (p.gap < 0.0)
     if pair.kinematics.ends.out is not None:

@@ -209,7 +209,9 @@ class Watch:
             return
         whole = group[0].pair.whole
         gone = whole.off & ~self._off_at_start[id(whole)] & ~whole.tied
-        some = dict(zip(map(id, whole.members), np.bincount(whole.label[gone], minlength=len(whole.members)) > 0))
+        some = dict(
+            zip(map(id, whole.members), np.bincount(whole.discretisation.setting.label[gone], minlength=len(whole.members)) > 0)
+        )
         mine = np.array([some[id(c.pair)] for c in group])
         for contact, some in zip(group, reduced(whole.config.comm, mine, op=MPI.LOR)):
             if some:
@@ -249,7 +251,7 @@ def _warn_of_sagging_facets(group: Sequence[WatchedContact]) -> None:
     whole = group[0].pair.whole
     some = np.ones(len(whole.members), dtype=bool)
     if len(some) > 1:
-        near = np.bincount(whole.label[sagging(whole)[0]], minlength=len(some)) > 0
+        near = np.bincount(whole.discretisation.setting.label[sagging(whole)[0]], minlength=len(some)) > 0
         some = reduced(whole.config.comm, near, op=MPI.LOR)
     near_pairs = {id(member) for member, one in zip(whole.members, some) if one}
     for contact in group:

@@ -208,7 +208,9 @@ class ExplicitStepper:
         problem, control, given = self.problem, self.problem.step_control, 0.0
         for pair in problem.system.pairs:
             opened = pair.committed.active & ~pair.trial.active
-            given += 0.5 * float((pair.committed.lam * np.maximum(pair.gap, 0.0))[opened].sum()) if opened.any() else 0.0
+            given += (
+                0.5 * float((pair.committed.lam * np.maximum(pair.kinematics.gap, 0.0))[opened].sum()) if opened.any() else 0.0
+            )
         words = control.too_much(reduced(problem.comm, given), dt, self.dynamics.kinetic_energy)
         if words is not None:
             control.refuse_energy(words, dt)

@@ -106,7 +106,7 @@ class FarApart:
         # contacts with active contactors, or contactors past an end, are searched
         for place, p in zip(self._places, self._wholes):
             used = p.trial.active | p.trial.passed | p.trial.barred
-            more[1, place[p.label[used]]] = 1.0
+            more[1, place[p.discretisation.setting.label[used]]] = 1.0
         self._boxes, (offset, used) = self._look(self._config.x, more)
         self._near = self._reach + offset
         far = (used == 0.0) & (self._boxes.apart > self._near)
@@ -188,4 +188,9 @@ class FarApart:
 
 def _may_be_far(pair: Interface) -> bool:
     measured = pair.discretisation.traits.at_feet and getattr(pair.target, "measures", False)
-    return measured and pair.sliding == "finite" and pair.tie is None and not (pair.heats or pair.trial.has_law)
+    return (
+        measured
+        and pair.discretisation.traits.sliding == "finite"
+        and pair.tie is None
+        and not (pair.heats or pair.trial.has_law)
+    )

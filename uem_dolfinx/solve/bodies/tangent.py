@@ -189,7 +189,7 @@ def curvature_of(
         convex: whether terms that could make the tangent indefinite are neglected.
         linear: equations of users, or None.
     """
-    moving = [pair for pair in pairs if pair.sliding == "finite"]
+    moving = [pair for pair in pairs if pair.discretisation.traits.sliding == "finite"]
     if not moving and linear is None:
         return None
     parts = [part for pair in moving for part in pair.curvature()]

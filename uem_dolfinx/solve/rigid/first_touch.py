@@ -39,7 +39,7 @@ def touch_ahead(
         look_within: searches contacts that may come near by motions of a given length; see ``FarApart``.
     """
     config, comm = bodies.config, bodies.comm
-    known = reduced(comm, any(pair.frictional or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
+    known = reduced(comm, any(pair.friction is not None or pair.trial.lam.any() for pair in pairs), op=MPI.LOR)
     if known or rigid is None:
         return
     place()
@@ -85,7 +85,11 @@ def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[
         config: configuration of the displacement.
         pairs: of all contacts.
     """
-    moving = [pair.target for pair in pairs if pair.sliding == "finite" and pair.target.n_nodes and pair.tie is None]
+    moving = [
+        pair.target
+        for pair in pairs
+        if pair.discretisation.traits.sliding == "finite" and pair.target.n_nodes and pair.tie is None
+    ]
     facets = list({id(target.dofs): target.dofs for target in moving}.values())
     every = np.arange(config.n_local)
 

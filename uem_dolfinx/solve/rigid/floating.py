@@ -7,7 +7,9 @@ determinate supports with zero reactions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +18,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface, in_question
 from uem_dolfinx.contact.seam.active_set import TOUCHING
 from uem_dolfinx.contact.seam.placement import ContactRows
@@ -140,6 +142,15 @@ class FloatingBodies:
     def begin_motion(self) -> None:
         """Use the motions of a time step for the first acceleration."""
         self.motions = self._in_motion
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Context in which something else holds all bodies, so that none falls."""
+        motions, self.motions = self.motions, None
+        try:
+            yield
+        finally:
+            self.motions = motions
 
     def end_step(self) -> None:
         """Refuse a state in which supports carry more than rounding; in a time step, warn.
@@ -288,7 +299,10 @@ class FloatingBodies:
             place()
             self._bodies.assemble()
             for pair in in_question(self._pairs):
-                pair.release_apart()
+                # without friction, rigid motions may have separated contactors from the target
+                if pair.friction is None:
+                    near = pair.kinematics.gap <= TOUCHING * self._bodies.config.size
+                    pair.set_active(replace(pair.trial, active=pair.trial.active & near))
             v, took = self._step(damping, freely)
             changed |= took
             if v is None:
@@ -323,7 +337,7 @@ class FloatingBodies:
         more = [] if self._linear is None else [self._linear.at_present(), *self._linear.sprung()]
         rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
         # sticking contactors are held in all directions; contactors without friction may separate again
-        firm = [(e.permanent | pair.frictional)[e.resisting.active] for pair, e in zip(pairs, equations)]
+        firm = [(e.permanent | (pair.friction is not None))[e.resisting.active] for pair, e in zip(pairs, equations)]
         which = np.concatenate([np.zeros(0, bool), *firm, *(np.ones(len(e), bool) for e in more)])
         rates = motions.rates(rows)
         return _Held(rows, rates, which, motions.open_motions(rates[which]))
@@ -365,7 +379,7 @@ class FloatingBodies:
             return None, False
         pairs = in_question(self._pairs)
         ahead = [pair.approach for pair in pairs]
-        front = UnitingEquations.join(ahead, config.gdim)
+        front = UnitingEquations.join([rows for _, rows in ahead], config.gdim)
         R = vstack([motions.rates(front), held.rates[~held.which]]).tocsr()
         gap = np.concatenate([front.gap, held.rows.gap[~held.which]])
         # the mass of each body is proportional to its load; bodies without loads are nearly massless
@@ -379,10 +393,10 @@ class FloatingBodies:
         if loose:
             free = B @ (B.T @ f)
             carries = (push > 0) | ((R @ free < -OPEN * np.linalg.norm(free)) & (R @ v <= OPEN * np.linalg.norm(free)))
-            parts = np.split(carries[: sum(len(e) for e in ahead)], np.cumsum([len(e) for e in ahead])[:-1])
-            active = [pair.activate_closing(c) for pair, c in zip(pairs, parts)]
+            parts = np.split(carries[: len(front)], np.cumsum([len(i) for i, _ in ahead])[:-1])
+            active = [_activate(pair, i[c]) for pair, (i, _), c in zip(pairs, ahead, parts)]
             took = any(active)
-            if freely and any(a and pair.frictional for a, pair in zip(active, pairs)):
+            if freely and any(a and pair.friction is not None for a, pair in zip(active, pairs)):
                 return np.zeros_like(v), True
         if not freely:
             return None, took
@@ -415,3 +429,12 @@ class FloatingBodies:
         np.minimum.at(ways, terms.col[large] // motions.n_modes, way[terms.row[large]])
         self._bodies.comm.Allreduce(MPI.IN_PLACE, ways, op=MPI.MIN)
         return ways
+
+
+def _activate(pair: Interface, closing: Ints) -> bool:
+    """Activate contactors ``closing (k,)`` that touch, negative for those whose gaps hold by themselves (collective): whether any do."""
+    now = closing[(closing >= 0) & (pair.kinematics.gap[closing] <= TOUCHING * pair.config.size)]
+    active = pair.trial.active.copy()
+    active[now] = True
+    pair.set_active(replace(pair.trial, active=active))
+    return bool(reduced(pair.config.comm, len(now)))

@@ -108,7 +108,11 @@ def _may_rest(problem: Any) -> bool:
         problem.dynamics is None and not problem.step_control.cut and problem.linear is None and not problem.config.unknowns.mixed
     )
     return (
-        alone and floating is not None and floating.motions is not None and bool(pairs) and not any(p.frictional for p in pairs)
+        alone
+        and floating is not None
+        and floating.motions is not None
+        and bool(pairs)
+        and not any(p.friction is not None for p in pairs)
     )
 
 
@@ -162,12 +166,11 @@ def _rest(problem: Any, converge: Callable[[], list[Any]]) -> list[Any] | None:
 @contextmanager
 def _dragged(problem: Any, drag: _Drag) -> Iterator[None]:
     """Context in which a drag holds all bodies, so that none falls."""
-    bodies, floating = problem.bodies, problem.system.floating
-    points, motions = bodies.tangent.points, floating.motions
+    bodies = problem.bodies
+    points = bodies.tangent.points
     try:
-        floating.motions = None
-        yield
+        with problem.system.floating.held():
+            yield
     finally:
-        floating.motions = motions
         bodies.tangent.take_points(points)
         problem.system.forget()

@@ -71,7 +71,7 @@ class _Slots:
         place[own.contactor[rows], own.tangent[rows] + 1] = rows
         there = place[:, 0] >= 0
         there[there] = near[place[there, 0]]
-        place[~pair.trial.active & (pair.off | ~pair.movable | ~there)] = -1
+        place[~pair.trial.active & (pair.off | ~pair.kinematics.movable | ~there)] = -1
         contactor = np.flatnonzero(place[:, 0] >= 0)
         along = place[contactor, 1:]
         there = along >= 0

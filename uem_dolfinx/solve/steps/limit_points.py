@@ -74,7 +74,7 @@ class LimitPoint:
     def _may_slide(self) -> bool:
         """Whether conditions leave a body several motions that only contact without friction resists (collective)."""
         floating = getattr(self._problem.system, "floating", None)
-        if floating is None or floating.motions is None or any(pair.frictional for pair in self._problem.pairs):
+        if floating is None or floating.motions is None or any(pair.friction is not None for pair in self._problem.pairs):
             return False
         # each column is of one body
         motions = floating.motions.open_motions(None).tocsc()

@@ -6,6 +6,7 @@ Every converged step is committed, so that a failed run keeps its last converged
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import compress
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.errors import InputError, PrecisionError, SpaceError, StepAccuracyError, UEMError
@@ -246,7 +248,7 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
     if dynamics.contactors != "massless":
         logger.warning("%s, from time %.6g: their contactors have mass; take contactors='massless'", words, dynamics.time)
         return
-    barred = [pair.bar_returned() for pair in problem.pairs]
+    barred = [_bar_returned(pair) for pair in problem.pairs]
     for pair, count in zip(problem.pairs, barred):
         if count:
             logger.warning(
@@ -257,6 +259,13 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
                 dynamics.time,
             )
     control.refuse_energy(words, length, any(barred))
+
+
+def _bar_returned(pair: Interface) -> int:
+    """Exclude contactors that had sunk past the target's end and re-entered in this step; return their number (collective)."""
+    came = pair.trial.active & ~pair.committed.active & pair.committed.passed
+    pair.committed = replace(pair.committed, barred=pair.committed.barred | came)
+    return int(reduced(pair.config.comm, int(came.sum())))
 
 
 def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:

@@ -22,7 +22,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, name_at
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Pivoting, Rule, Violations
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import ConvergenceError, FrictionError
@@ -99,7 +99,7 @@ class Exchanges:
 
     def __init__(self, pairs: Sequence[Interface]):
         self._pairs = pairs
-        self._frictional = any(pair.frictional for pair in pairs)
+        self._frictional = any(pair.friction is not None for pair in pairs)
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -261,7 +261,7 @@ class Exchanges:
         config = self._pairs[0].config
         along = [pair.config.X[pair.nodes] @ ALONG[: config.gdim] for pair in self._pairs]
         first = np.cumsum([0, *(len(pair.members) for pair in self._pairs)])
-        label, least = [k + pair.label for k, pair in zip(first, self._pairs)], np.full(first[-1], np.inf)
+        label, least = [k + pair.discretisation.setting.label for k, pair in zip(first, self._pairs)], np.full(first[-1], np.inf)
         for which, w, a in zip(label, violated, along):
             np.minimum.at(least, which, np.where(w.which, a, np.inf))
         config.comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
@@ -286,7 +286,7 @@ class Exchanges:
             self.convex = norm > WHOLE_AGAIN * self._from
         if not self.convex:
             self._from = 0.0
-        here = _Visit(self._state(), norm, [pair.pattern for pair in self._pairs], self._changed)
+        here = _Visit(self._state(), norm, [_pattern(pair.trial) for pair in self._pairs], self._changed)
         back = [k for k, v in enumerate(self._visits) if v.state == here.state and norm > NO_LESS * v.norm > 0.0]
         self._visits.append(here)
         if not back:
@@ -303,7 +303,7 @@ class Exchanges:
             self.convex, self._from = True, max(norm, self._from)
             return False
         self._visits, self._rounds = [], self._rounds + 1
-        calm = reduced(comm, np.array([pair.calm(c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
+        calm = reduced(comm, np.array([_calm(pair, c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
         for pair in (pair for pair, some in zip(self._pairs, calm) if some):
             pair.project()
         calmed = bool(calm.any())
@@ -318,12 +318,12 @@ class Exchanges:
 
     def _pattern(self) -> int:
         """Fingerprint of the present states of this rank's contactors."""
-        return zlib.crc32(b"".join(pair.pattern.tobytes() for pair in self._pairs))
+        return zlib.crc32(b"".join(_pattern(pair.trial).tobytes() for pair in self._pairs))
 
     def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
         """The error for a cycle, with the names of contactors, marked in masks ``(n,)`` of every pair."""
         own = [
-            (tuple(pair.config.X[pair.nodes[i]]), pair.name_at(int(i)), pair.config.describe(int(pair.nodes[i])))
+            (tuple(pair.config.X[pair.nodes[i]]), name_at(pair, int(i)), pair.config.describe(int(pair.nodes[i])))
             for pair, c in zip(self._pairs, changed)
             for i in np.flatnonzero(c)
         ]
@@ -335,6 +335,22 @@ class Exchanges:
             f"the active set cycles: contactors {why} in turn: {names}{more}; take smaller load steps, or a target of finer "
             f"facets there{', or less friction' if self._frictional else ''}"
         )
+
+
+def _pattern(t: PairState) -> Ints:
+    """Integers that identify the state of each contactor: active, corner, stick and direction of slip ``(n, k)``."""
+    found, f = np.column_stack([t.active, t.held]).astype(np.int64), t.friction
+    return found if f is None else np.column_stack([found, f.stick, np.rint(f.direction).astype(np.int64)])
+
+
+def _calm(pair: Interface, which: Bools) -> bool:
+    """Set averaged normals in this step for contactors of ``which (n,)`` that alternate between facets: whether there are any."""
+    from uem_dolfinx.contact.nodes.concave_edges import HOLD_AFTER, MOST_CHANGES
+
+    changes = pair.trial.changes
+    some = which & pair.trial.active & (changes >= HOLD_AFTER) & (changes < MOST_CHANGES)
+    pair.trial = replace(pair.trial, changes=np.where(some, MOST_CHANGES, changes))
+    return bool(some.any())
 
 
 def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:

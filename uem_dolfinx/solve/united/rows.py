@@ -38,7 +38,7 @@ class OverConstraints:
 
     Args:
         config: configuration of the displacement.
-        pairs: of all contacts; ``mutual`` is set if their surfaces are contactor and target of each other.
+        pairs: of all contacts; ``mutual`` of their settings is set if surfaces are contactor and target of each other.
         linear: equations of users, or None.
 
     Attributes:
@@ -76,14 +76,17 @@ class OverConstraints:
         refused = (both_ways & ~(tied[:, None] | tied)).any(axis=1)
         ends = np.cumsum([len(pair.members) for pair in whole])
         for pair, mutual in zip(whole, np.split(both_ways.any(axis=1), ends)):
-            pair.mutual = mutual
+            if (mutual != pair.discretisation.setting.mutual).any():
+                pair.discretisation.set(mutual=mutual)
         for pair, wrong in zip(pairs, refused):
             if wrong and not pair.discretisation.traits.two_pass:
                 raise ConflictError(
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
                     "one of the two contacts, or give both coupling='node_to_surface'"
                 )
-        self.stacked = bool(meets.any()) or any(pair.chained for pair in whole)
+        self.stacked = bool(meets.any()) or any(
+            pair.discretisation.traits.chained or (pair.tie is not None and pair.tie.chained) for pair in whole
+        )
         self.contestable = self.shared or any(pair.discretisation.setting.prescribed for pair in whole)
         if any(_united_fields(pair) for pair in pairs):
             # rows contain temperatures of both sides, which may be prescribed
@@ -229,7 +232,7 @@ class BodyState(IterationState):
         Contactors within reach are those that the velocity of the last step's end brings together (collective).
         """
         dynamics = bodies.dynamics
-        if dynamics is None or solver.lasting or solver.iterative or not any(pair.frictional for pair in pairs):
+        if dynamics is None or solver.lasting or solver.iterative or not any(pair.friction is not None for pair in pairs):
             return None
         du = dynamics.dt * dynamics.velocity.x.array[: bodies.forces.size].reshape(-1, bodies.config.gdim)
         return self.rows.settle(bodies, F(), G, du)
@@ -305,7 +308,7 @@ def _meet(rigid: Sequence[Interface]) -> None:
     if not rigid:
         return
     node, held = (np.concatenate(parts) for parts in zip(*((pair.nodes, pair.trial.active) for pair in rigid)))
-    normal = np.concatenate([pair.projection.normal for pair in rigid])
+    normal = np.concatenate([pair.kinematics.projection.normal for pair in rigid])
     i = np.flatnonzero(held)
     i = i[np.argsort(node[i], kind="stable")]
     # contactors with several rows, each row among those of its node
@@ -321,7 +324,8 @@ def _meet(rigid: Sequence[Interface]) -> None:
     if k > 1:
         others[i, place] = 0.0
     for pair, own in zip(rigid, np.split(others, np.cumsum([len(pair.nodes) for pair in rigid])[:-1])):
-        pair.meet(own)
+        if pair.friction is not None:
+            pair.friction.meet(pair.kinematics, own)
 
 
 def _surfaces(pairs: Sequence[Interface]) -> tuple[list[Indices], Ints]:

@@ -30,6 +30,7 @@ from uem_dolfinx.solve.rigid.unheld import refuse_bare
 from uem_dolfinx.solve.united import rows as united_rows
 from uem_dolfinx.solve.united.exchanges import Exchanges, count
 from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.normal_return import move_back
 from uem_dolfinx.solve.united.rows import BodyState, OverConstraints, Rows, make_rows
 
 if TYPE_CHECKING:
@@ -124,25 +125,10 @@ class BodySystem:
 
     def return_to_targets(self, bound: float) -> bool:
         """Normal return [UEM, 4.2]: move active contactors back onto the moved targets (collective); see ``ContactMethod``."""
-        if not self.pairs:
-            return False
-        assert self.bodies.stiffness is not None
-        ways = [pair.return_vectors() for pair in self.near]
-        made = [self.bodies.stiffness[pair.nodes] * way for pair, way in zip(self.near, ways)]
-        disturbance = np.sqrt(reduced(self.comm, float(sum((forces**2).sum() for forces in made))))
-        if not 0.0 < disturbance <= bound:
-            return False
-        shared = self.over_constraints.shared
-        for k, (pair, way) in enumerate(zip(self.near, ways)):
-            for j, rows in enumerate(united_rows.in_turns(pair) if shared else [np.arange(len(way))]):
-                if shared and j + k > 0:
-                    # nodes may have been returned by another pair already
-                    pair.project()
-                    way = pair.return_vectors()
-                self.config.shift(pair.nodes[rows], way[rows])
-        self.bodies.u.x.scatter_forward()
-        self.place()
-        return True
+        moved = bool(self.pairs) and move_back(self.bodies, self.near, self.over_constraints.shared, bound)
+        if moved:
+            self.place()
+        return moved
 
     def begin_step(self) -> None:
         """Begin a step: bodies that only contact holds fall until they touch; for others, the first contact is predicted."""
@@ -150,7 +136,7 @@ class BodySystem:
         self.exchanges.begin_step()
         for pair in self.pairs:
             pair.discretisation.begin_step()
-            if pair.sliding == "small":
+            if pair.discretisation.traits.sliding == "small":
                 pair.project()
         self.floating.begin_step(self.place)
         if self.pairs and self.bodies.dynamics is None and self.floating.motions is None:
@@ -206,8 +192,10 @@ class BodySystem:
                     at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             self._swept = not at_rest
             moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
-            here = [(pair, pair.stiffness_across(bodies.stiffness), bodies.rounding_at(pair.nodes)) for pair in pairs]
-            found = [pair.violated(pair.gap, pair.traction, across, least, 0.0, self._swept) for pair, across, least in here]
+            here = [(pair, self._across(pair), bodies.rounding_at(pair.nodes)) for pair in pairs]
+            found = [
+                pair.violated(pair.kinematics.gap, pair.traction, across, least, 0.0, self._swept) for pair, across, least in here
+            ]
             violated = count(pairs, found)
             # a released body falls, even if the active set still changes
             unsettled = moved or (violated > 0 and not (at_rest and self.floating.adrift))
@@ -239,6 +227,12 @@ class BodySystem:
             added=added,
             held=held,
         )
+
+    def _across(self, pair: Interface) -> Array:
+        """Stiffness of contactors along their normals ``(n,)``."""
+        assert self.bodies.stiffness is not None
+        normal = pair.kinematics.projection.normal
+        return np.asarray(np.einsum("ng,ng->n", normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
     def present_rows(self) -> Rows:
         """Equations at the last projection, with its slip directions (collective)."""
@@ -286,10 +280,10 @@ class BodySystem:
             near = max(PREDICTED, left) * way
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
-            gaps = [pair.kinematics.gap_rows.gaps(increment) if pair.asked else pair.gap for pair in self.pairs]
+            gaps = [pair.kinematics.gap_rows.gaps(increment) if pair.asked else pair.kinematics.gap for pair in self.pairs]
             violated = [Violations.none(len(pair.nodes)) for pair in self.pairs]
             for k, pair in ((k, pair) for k, pair in enumerate(self.pairs) if pair.asked):
-                along = pair.stiffness_across(self.bodies.stiffness)
+                along = self._across(pair)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated[k] = pair.violated(gaps[k], forces[k], along, least, near, self._swept, moved)
             costly = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap)
@@ -327,7 +321,7 @@ class BodySystem:
 
     def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
         """Unbounded sliding of bodies under predicted forces ``(n_owned, gdim)``; None if friction holds them (collective)."""
-        if self.floating.motions is None or not any(pair.frictional for pair in self.pairs):
+        if self.floating.motions is None or not any(pair.friction is not None for pair in self.pairs):
             return None
         # contact forces include the known forces
         every = F + (self.bodies.residual - self.residual())
