@@ -32,7 +32,7 @@ from uem_dolfinx.compiled import kept
 from uem_dolfinx.parallel import reduced
 
 #: Integrands that are no polynomials get a quadrature rule of this times the degree of the displacement.
-#: [convention; degrees; test_elastic.py::test_degrees_that_are_asked_for]
+#: [convention; degrees; test_elastic.py::test_degrees_that_are_set]
 DEGREES_ENOUGH = 4
 
 

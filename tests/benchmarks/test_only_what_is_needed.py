@@ -201,7 +201,7 @@ def test_elastic_bodies_have_no_history(comm):
     assert calls["commit history"] == 2 < calls["return mapping"]
 
 
-def test_output_only_where_asked_for(comm, folder):
+def test_output_only_where_wanted(comm, folder):
     """Nothing is written unless a writer is made."""
     b = blocks(comm, "quadrilateral")
     problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])

@@ -17,7 +17,7 @@ CASES = {case.name: case for case in EVERY}
 UNITED, MORTAR = COLUMNS[:2]
 
 
-def test_names_are_told_apart_on_the_command_line():
+def test_names_differ_on_the_command_line():
     assert len(CASES) == len(EVERY)
     assert not any("," in name for name in CASES)
     assert len({column.name for column in COLUMNS}) == len(COLUMNS)

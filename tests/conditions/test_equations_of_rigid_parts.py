@@ -10,32 +10,20 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import box, linear, refused, scene, slow, st_venant
+from helpers import linear, refused, slow, st_venant
+from rigid_boxes import RigidBoxes, quadratic
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 
 COMM = MPI.COMM_WORLD
 CELLS = ["quadrilateral", slow("triangle"), slow("tetrahedron"), "hexahedron"]
 
 
-class Row:
-    """Rigid boxes of length 2 in a row, with gaps of 0.5 between them."""
+class Row(RigidBoxes):
+    """Rigid boxes, with the middles of their lower edges as points."""
 
     def __init__(self, cell="quadrilateral", n=2, comm=COMM):
-        g = self.g = 2 if cell in ("quadrilateral", "triangle") else 3
-        ends = [([2.5 * i, *[0.0] * (g - 1)], [2.5 * i + 2.0, *[1.0] * (g - 1)]) for i in range(n)]
-        self.scene = scene(comm, cell, [box(cell, *end, [2, *[1] * (g - 1)]) for end in ends])
-        self.V = compat.function_space(self.scene.mesh, 1, (g,))
-        self.u = fem.Function(self.V, name="u")
-        self.tags = [self.scene.tag(f"body {i}", i, lambda x: x[:, 0] >= -1.0) for i in range(n)]
-
-    def at(self, x, y=0.0, z=0.0):
-        return np.array([x, y, z])[: self.g]
-
-    def part(self, i, **how):
-        """Body i, with the middle of its lower edge as point."""
-        return uem.RigidCoupling(self.tags[i], self.at(2.5 * i + 1.0), **how)
+        super().__init__(cell, n, comm)
 
     def equation(self, *terms, b=0.0):
         """``sum c . u(x)`` over pairs of x and y, and a component and a coefficient."""
@@ -55,11 +43,6 @@ class Row:
 def turn(one):
     """Its angle in the plane."""
     return float(np.ravel(one.rotation)[-1])
-
-
-def quadratic(iterations):
-    r = [i.residual for i in iterations]
-    return any(1e-9 < a < 1e-2 and after <= 10.0 * a**2 + 1e-13 for a, after in zip(r, r[1:]))
 
 
 @pytest.mark.parametrize("cell", CELLS)

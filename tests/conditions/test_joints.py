@@ -10,10 +10,10 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import box, clamp, highest, linear, refused, scene, slow, st_venant
+from helpers import clamp, highest, linear, refused, slow, st_venant
+from rigid_boxes import RigidBoxes, quadratic
 
 import uem_dolfinx as uem
-from uem_dolfinx import compat
 from uem_dolfinx.conditions.joints import across
 from uem_dolfinx.conditions.pair_motion import RA, RB, TA, TB, Body, angle, distance, projected
 from uem_dolfinx.geometry.rigid import rotation_matrix
@@ -21,24 +21,12 @@ from uem_dolfinx.geometry.rigid import rotation_matrix
 COMM = MPI.COMM_WORLD
 
 
-class Row:
-    """Boxes of length 2 in a row, with gaps of 0.5 between them, each of them rigid."""
+class Row(RigidBoxes):
+    """Rigid boxes with their middles as points."""
 
     def __init__(self, cell="quadrilateral", n=2):
-        g = 2 if cell in ("quadrilateral", "triangle") else 3
-        self.g, self.k, flat = g, 1 if g == 2 else 3, [1.0] * (g - 1)
-        boxes = [box(cell, [2.5 * i, *[0.0] * (g - 1)], [2.5 * i + 2.0, *flat], [2, *[1] * (g - 1)]) for i in range(n)]
-        self.scene = scene(COMM, cell, boxes)
-        self.V = compat.function_space(self.scene.mesh, 1, (g,))
-        self.u = fem.Function(self.V, name="u")
-        self.tags = [self.scene.tag(f"body {i}", i, lambda x: x[:, 0] >= -1.0) for i in range(n)]
-
-    def at(self, x, y=0.5, z=0.5):
-        return np.array([x, y, z])[: self.g]
-
-    def part(self, i, **how):
-        """Body i with its middle as point."""
-        return uem.RigidCoupling(self.tags[i], self.at(2.5 * i + 1.0), **how)
+        super().__init__(cell, n, height=0.5)
+        self.k = 1 if self.g == 2 else 3
 
     def held(self, i=0, **how):
         return self.part(i, motion=[0.0] * (self.g + self.k), **how)
@@ -48,11 +36,6 @@ class Row:
 
     def vector(self, x, y, z=0.0):
         return np.array([x, y, z])[: self.g]
-
-
-def quadratic(iterations):
-    r = [i.residual for i in iterations]
-    return any(1e-9 < a < 1e-2 and after <= 10.0 * a**2 + 1e-13 for a, after in zip(r, r[1:]))
 
 
 # -- scalars of two bodies -------------------------------------------------------------------------------------------------

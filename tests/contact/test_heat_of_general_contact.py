@@ -92,7 +92,7 @@ def test_by_mortar():
     assert contact.heat_balance() < 1e-13
 
 
-def test_what_touches_nothing_is_not_asked(monkeypatch):
+def test_what_touches_nothing_is_not_searched(monkeypatch):
     """Of the lists of a general contact those with nothing on them look for nothing that is opposite."""
     from uem_dolfinx.contact.thermal import heat
 

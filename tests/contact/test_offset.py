@@ -194,7 +194,7 @@ def test_adjusted_waves(coupling, degree):
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
-def test_tied_gaps_are_told(coupling):
+def test_tied_gaps_are_reported(coupling):
     b = blocks(COMM, "triangle", 2, 3, gap=0.03)
     tied = uem.Contact(b.high, b.low, coupling=coupling, tied=True)
     uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=clamp(b.V, b.bottom), contacts=[tied])

@@ -1,6 +1,6 @@
 """Convex corners of a target that enter the contactors' facets, where nodes do not see them: warnings with the place, and of no others.
 
-Worth reading first: ``test_corners_that_are_told`` and ``test_harmless_scenes``.
+Worth reading first: ``test_corners_that_are_warned_of`` and ``test_harmless_scenes``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TOLD = [
 
 
 @pytest.mark.parametrize("make, how", TOLD, ids=[f"{make.__name__}-{k}" for k, (make, _) in enumerate(TOLD)])
-def test_corners_that_are_told(make, how, caplog):
+def test_corners_that_are_warned_of(make, how, caplog):
     """Once, with contact and place; not where they are the contactors'."""
     (problem, *_), tips = make(**how)
     run(problem, 2)
@@ -194,7 +194,7 @@ def test_what_is_a_corner(slope, cosine, expected, monkeypatch):
         ("ON_FACET", {"w": 0.495, "push": 1e-3}, {1: 0, 0.1: 1}),
     ],
 )
-def test_what_is_told(name, how, moved, monkeypatch):
+def test_what_a_warning_of_corners_contains(name, how, moved, monkeypatch):
     """Corners that are deep enough in their facet, and by which enough of the force is lacking."""
     (problem, contact, _), _ = punch(**how)
     run(problem)

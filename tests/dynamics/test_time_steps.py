@@ -187,7 +187,7 @@ def test_massy_contactors_warn(caplog):
     assert f[:, 1].max() > 600
 
 
-def test_steps_that_give_massy_contactors_energy_are_told(caplog):
+def test_steps_that_give_massy_contactors_energy_are_warned_of(caplog):
     """Each step in which the bar's energy grows by more than a hundredth of what it began with, and none in flight."""
     bar = Bar(20, contactors="massy")
     with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):

@@ -248,7 +248,7 @@ def test_live_model_and_msh_file(plates, comm, folder):
 # -- what is refused ---------------------------------------------------------------------------------------------------
 
 
-def test_tags_asked_for_wrongly(plates, comm):
+def test_tags_named_wrongly(plates, comm):
     _, tags = read_gmsh(plates, comm)
     with pytest.raises(uem.TagError, match=r"'contacter', did you mean 'contactor'.*'lower' \(dimension 2\)"):
         tags["contacter"]

@@ -168,7 +168,7 @@ def test_iterative_solvers():
     assert found[0] == pytest.approx(found[1], rel=1e-8)
 
 
-def test_one_sided_contactors_are_told(caplog):
+def test_one_sided_contactors_are_warned_of(caplog):
     """Blocks that touch without force: the gradient is that of one side, and a warning tells of it."""
     b = blocks(COMM, "triangle", 2, 4)
     E = fem.Constant(b.scene.mesh, 1.0)

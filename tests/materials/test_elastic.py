@@ -161,7 +161,7 @@ def test_quadrature_of_what_is_no_polynomial(cell, degree, monkeypatch):
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("degree", [1, 2])
-def test_degrees_that_are_asked_for(law, degree):
+def test_degrees_that_are_set(law, degree):
     """A rational law gets a sensible rule, also in its tangent; a polynomial one, and a rule that is named, stay as they are."""
     b = blocks(MPI.COMM_WORLD, "quadrilateral", 1, 1, degree=degree)
     v = ufl.TestFunction(b.V)

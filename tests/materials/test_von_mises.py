@@ -343,7 +343,7 @@ def test_bad_input_is_refused(comm, given, says):
         uem.VonMises(u, **{"E": E, "nu": NU, "yield_stress": FY, "kind": "plane_strain"} | given)
 
 
-def test_bad_parameters_of_one_cell_are_told_by_all_ranks(comm):
+def test_bad_parameters_of_one_cell_are_an_error_on_all_ranks(comm):
     s, u = block(comm, "quadrilateral", 4)
     modulus = fem.Function(compat.function_space(s.mesh, ("DG", 0)))
     modulus.x.array[:] = E

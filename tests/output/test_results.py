@@ -83,7 +83,7 @@ def test_columns_name_the_contacts_where_there_are_several(folder: Path) -> None
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_columns_that_are_asked_for(folder: Path, cell: str) -> None:
+def test_columns_that_are_chosen(folder: Path, cell: str) -> None:
     """Reactions of supports and quantities of the user's own; the support bears what the contact carries."""
     problem = pressed(cell)
     axes, u = "xyz"[: problem.config.gdim], problem.u

@@ -183,7 +183,7 @@ def steel(u, **how):
     return uem.VonMises(u, 1.0, 0.3, 0.01, 0.1, kind="plane_strain", **how)
 
 
-def test_laws_with_history_that_are_not_told():
+def test_laws_with_history_that_are_not_given():
     b = blocks(COMM, "triangle", 2, 2)
     v, law, twin = ufl.TestFunction(b.V), steel(b.u), steel(fem.Function(b.V))
     for F, materials, error, words in (

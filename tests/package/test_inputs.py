@@ -375,7 +375,7 @@ def test_functions_of_rigid_surfaces(what, wrong, error, words, everywhere):
     refused(error, (f"anvil: {what}", *words), lambda: pressed(other, contacts=[uem.Contact(other.high, tool)]))
 
 
-def test_functions_of_rigid_surfaces_are_not_asked_about_nothing():
+def test_functions_of_rigid_surfaces_are_not_called_without_points():
     """On ranks without contactors a function that cannot do without points is left alone."""
 
     def distance(x):

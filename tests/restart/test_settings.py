@@ -126,7 +126,7 @@ def test_settings_without_a_default(folder):
     )
 
 
-def test_other_steps_are_told(folder, caplog):
+def test_other_steps_are_reported(folder, caplog):
     """Steps of another length are no other run: a warning says it, once."""
     for end, dt, told in ((0.02, 0.01, 0), (0.04, 0.01, 0), (0.08, 0.02, 1), (0.1, 0.02, 0)):
         caplog.clear()

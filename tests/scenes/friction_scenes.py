@@ -131,7 +131,7 @@ def fields(problem: uem.UnitedProblem, pair: Any) -> tuple[Array, Array, Array]:
 
 
 #: Radius of the cylinder's surface, and how far the bodies reach.
-RADIUS, REACH = 8.0, 3.0
+RADIUS, HALF_WIDTH = 8.0, 3.0
 
 
 @dataclass
@@ -142,7 +142,7 @@ class Cylinder(Driven):
 
     def facet(self, x: float) -> float:
         """Length of the facets at a distance from the middle."""
-        return 2 * np.sqrt(REACH * max(x, REACH / self.n**2)) / self.n
+        return 2 * np.sqrt(HALF_WIDTH * max(x, HALF_WIDTH / self.n**2)) / self.n
 
 
 def cylinder(
@@ -151,18 +151,18 @@ def cylinder(
     """A body with a round lower surface on a flat one, of the same material; its top is driven."""
 
     def graded(body: Body) -> Body:
-        return body.mapped(lambda x: REACH * np.sign(x) * x**2)
+        return body.mapped(lambda x: HALF_WIDTH * np.sign(x) * x**2)
 
     def pose(x: Array) -> Array:
         y, high = x.copy(), np.arange(len(x)) >= len(lower.x)
-        y[high, 1] += y[high, 0] ** 2 / (2 * RADIUS) * (1 - y[high, 1] / REACH)
+        y[high, 1] += y[high, 0] ** 2 / (2 * RADIUS) * (1 - y[high, 1] / HALF_WIDTH)
         return y
 
     lower, upper = (graded(box("quadrilateral", [-1.0, y], [1.0, y + 1.0], [2 * n, n])) for y in (-1.0, 0.0))
     s = create_scene(comm, "quadrilateral", [lower, upper], pose=pose)
     V = compat.function_space(s.mesh, degree, (2,))
-    bottom, low = s.tag("bottom", 0, at(1, -REACH)), s.tag("low", 0, at(1, 0.0))
-    high, top = s.tag("high", 1, at(1, 0.0)), s.tag("top", 1, at(1, REACH))
+    bottom, low = s.tag("bottom", 0, at(1, -HALF_WIDTH)), s.tag("low", 0, at(1, 0.0))
+    high, top = s.tag("high", 1, at(1, 0.0)), s.tag("top", 1, at(1, HALF_WIDTH))
     u, driver = fem.Function(V), fem.Function(V)
     contact = uem.Contact(high, low, friction=mu, coupling=coupling)
     bcs = [*clamp(V, bottom), fem.dirichletbc(driver, fem.locate_dofs_topological(V, 1, top.entities))]

@@ -52,7 +52,7 @@ def test_dirichlet_values_are_met(value):
 
 
 @pytest.mark.parametrize("length", [1e-9, 1.0, 1e3])
-def test_forces_told_from_rounding(length):
+def test_forces_above_rounding(length):
     """A body carried far without strain has none; strained by 5e-12 of its way it has, where the other body does not count."""
     b = blocks(COMM, "triangle", 4, 5, gap=1.0, pose=lambda x: length * x)
     problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1e-3, 1e3)), b.u, bcs=clamp(b.V, b.bottom))

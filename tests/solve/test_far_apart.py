@@ -50,7 +50,7 @@ def test_what_is_far_apart(cell, degree):
         assert COMM.allreduce(len(told)) > 0 and highest(COMM, np.abs(told - gap)) <= 1e-14
 
 
-def test_rigid_surfaces_are_told_by_their_distance():
+def test_rigid_surfaces_are_far_by_their_distance():
     """What the box around a body is away from a plane counts; a paraboloid's gap is no distance, and it is always looked at."""
     _, problem = pressed("quadrilateral", 0.6, 0.0, rigid=True)
     problem.solve()
@@ -137,7 +137,7 @@ numbers = some.lists(some.floats(-3, 3), min_size=12, max_size=12)
 
 
 @given(numbers, some.lists(some.floats(0.0, 1.0), min_size=2, max_size=2))
-def test_no_way_is_nearer_than_told(numbers, at):
+def test_no_way_is_nearer_than_the_bound(numbers, at):
     """Points of two boxes, and of a box and a circle about the origin, are nowhere nearer on straight ways than what is told."""
     x = np.array(numbers).reshape(2, 3, 2)  # before and after: two contactors, one target node
     t, a = at

@@ -59,7 +59,7 @@ MAX_PENETRATION = 0.05
 COUPLINGS: tuple[Literal["node_to_surface", "mortar"], ...] = ("node_to_surface", "mortar")
 AFTER: tuple[Literal["after"]] = ("after",)
 BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size", lambda x: x >= 0)
-REACH = given.Range("True, False or a positive length", lambda x: x > 0)
+OF_ADJUST = given.Range("True, False or a positive length", lambda x: x > 0)
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
 
 
@@ -165,7 +165,7 @@ class Contact(WatchedContact, given.Sealed):
             self.normal = given_normal(normal, friction, wear, self.heats, tied)
             measure = given.word("measure", measure, ("reference", "current"))
             tied = given.word("tied", tied, AFTER) if isinstance(tied, str) else given.flag("tied", tied)
-            adjust = adjust if isinstance(adjust, (bool, np.bool_)) else given.number("adjust", adjust, REACH)
+            adjust = adjust if isinstance(adjust, (bool, np.bool_)) else given.number("adjust", adjust, OF_ADJUST)
             self._offset = given_field("offset", offset)
             self.cohesion, self.leak = given_joint(cohesion, leak, sliding, normal, friction, wear, self.heats, tied, offset)
             if coupling == "mortar" and (chords or normals != "facet"):

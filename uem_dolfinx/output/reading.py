@@ -23,7 +23,7 @@ from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.restart.numbering import n_cells
 
 #: Cells by their name in XDMF, with the degree of their geometry.
-CELLS = {name: (cell, 1 if n == len(forms.reference_topology(cell)[0]) else 2) for (cell, n), name in TOPOLOGIES.items()}
+OF_TOPOLOGY = {name: (cell, 1 if n == len(forms.reference_topology(cell)[0]) else 2) for (cell, n), name in TOPOLOGIES.items()}
 
 
 class Results:
@@ -63,7 +63,7 @@ class Results:
 
     def _make_mesh(self, comm: MPI.Comm, name: str, cells: Item, nodes: Item) -> Any:
         """The mesh of the files (collective)."""
-        cell, degree = CELLS[name]
+        cell, degree = OF_TOPOLOGY[name]
 
         def part(item: Item) -> AnyArray:
             return np.array(self._array(item)[item.rows * comm.rank // comm.size : item.rows * (comm.rank + 1) // comm.size])

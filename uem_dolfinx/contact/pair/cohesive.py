@@ -42,8 +42,6 @@ DAMAGE, DELAYED, AT, GREW, PERMANENT = range(5)
 class SofteningInterface(Interface):
     """Contactors with forces that soften as gaps open, which can make linearised problems indefinite."""
 
-    #: Its forces store and dissipate or release energy.
-    works = True
     #: Exchanges since the last placement.
     _exchanged = 0
     #: Whether bodies may come down to another equilibrium, by a stiffness without softening; not along an arc.

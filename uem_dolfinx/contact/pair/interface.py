@@ -274,11 +274,6 @@ class Interface(Readings):
         parts = k.curvature(self.trial) if along is None else k.curvature(self.trial, along)
         return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
-    def turn(self, stiffness: Array) -> None:
-        """Update the slip directions from the current positions; ``stiffness (n_owned, gdim)``: diagonal of K (collective)."""
-        if self.friction is not None:
-            self.trial = self.friction.turn(self.trial, self.kinematics, stiffness)
-
     def slip_terms(self) -> tuple[Ints, Array, Array] | None:
         """Terms of sliding friction in tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
         return None if self.friction is None else self.friction.slip_terms(self.trial, self.kinematics)

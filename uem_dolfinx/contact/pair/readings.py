@@ -105,11 +105,6 @@ class Readings:
         tau = 0.0 * t.force if t.friction is None else t.friction.tau
         return (t.lam, tau) if self.tie is None else self.tie.pressing(t, self.kinematics.projection.normal, t.lam, tau)
 
-    @property
-    def works(self) -> bool:
-        """Whether its forces do external work, for example on a moving rigid target."""
-        return self.target.motion is not None or (self.tie is not None and self.tie.works)
-
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without loads (collective)."""
         return None if self.tie is None else self.tie.applied_forces()

@@ -88,9 +88,6 @@ class SoftInterface(Interface):
         duration: length of the present step, a time; None in statics.
     """
 
-    #: Its forces store and release energy.
-    works = True
-
     def __init__(self, *args: Any, law: SoftContact, contact: Any, duration: Callable[[], float] | None = None, **how: Any):
         super().__init__(*args, **how)
         self._law, self._contact, self._duration = law, contact, duration

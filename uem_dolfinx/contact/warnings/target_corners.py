@@ -30,10 +30,10 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
 
 #: Corners that penetrate a facet by less than this part of its size lie on the facet.
-#: [convention; size of the facet; test_target_corners.py::test_what_is_told]
+#: [convention; size of the facet; test_target_corners.py::test_what_a_warning_of_corners_contains]
 ON_FACET = 1e-2
 #: A warning is given if the missing force of corners exceeds this part of the contact force: resultants are wrong by one per cent or more.
-#: [convention; largest contact force so far; test_target_corners.py::test_what_is_told]
+#: [convention; largest contact force so far; test_target_corners.py::test_what_a_warning_of_corners_contains]
 LACKING = 0.1
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 #: [derived; rounding of K u; test_bodies.py::test_rounding_of_forces]
 FORCE_ROUNDING = 4.0 * np.finfo(float).eps
 #: A force is told from rounding where it is larger by this factor.
-#: [convention; rounding of K u; test_bodies.py::test_forces_told_from_rounding]
+#: [convention; rounding of K u; test_bodies.py::test_forces_above_rounding]
 ABOVE_ROUNDING = 100.0
 #: Dirichlet values are met if they are to this part of the largest.
 #: [derived; the largest prescribed value; test_bodies.py::test_dirichlet_values_are_met]

@@ -217,7 +217,10 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
     """Contact forces on both bodies, at this rank's nodes, of each contact that should do no work (collective)."""
     closed = compress(problem.contacts, touching(problem))
     own = slice(problem.config.gdim * problem.config.n_owned)
-    return [np.array(c.force.x.array[own]) for c in closed if not c.pair.works]
+    idle = [
+        c for c in closed if not (c.pair.trial.has_law or c.pair.target.motion or (c.pair.tie is not None and c.pair.tie.works))
+    ]
+    return [np.array(c.force.x.array[own]) for c in idle]
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:

@@ -239,7 +239,8 @@ class BodySystem:
         if self._here is None:
             for pair in self.near:
                 assert self.bodies.stiffness is not None
-                pair.turn(self.bodies.stiffness)
+                if pair.friction is not None:
+                    pair.trial = pair.friction.turn(pair.trial, pair.kinematics, self.bodies.stiffness)
             self._here = self._rows()
         return self._here
 
