@@ -132,11 +132,6 @@ class ContactResults(HeatResults):
         """Number of active contactors over all ranks (collective)."""
         return int(reduced(self.config.comm, int(self.pair.united.sum())))
 
-    @property
-    def initial_overlap(self) -> float:
-        """Largest penetration of contactors before the first step, a length; 0 without penetration."""
-        return self.pair.initial_overlap
-
     def max_gap(self) -> float:
         """Largest gap of an active contactor, a length (collective)."""
         return float(reduced(self.config.comm, self.pair.largest_gap_here(), op=MPI.MAX))

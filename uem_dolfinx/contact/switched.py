@@ -40,15 +40,17 @@ def switch_off(pair: Interface) -> None:
     settle(pair, state)
 
 
-def switch_on(pair: Interface) -> None:
-    """Start contact of a pair in the current configuration, as at the start of a problem (collective).
+def switch_on(contact: Contact) -> None:
+    """Start a contact in the current configuration, as at the start of a problem (collective).
 
     Raises:
         PenetrationError: if a contactor is deeper inside than ``max_penetration``.
     """
+    pair = contact.pair
+    settle(pair)
     pair.discretisation.begin_step()
     pair.project()
-    check_initial(pair)
+    contact.note_overlap(check_initial(pair))
     pair.activate_touching()
 
 

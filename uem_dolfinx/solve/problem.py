@@ -240,7 +240,7 @@ class UnitedProblem(given.Sealed):
         #: Record of all steps for gradients, or None.
         self.history: Any = None
         for contact in self.contacts:
-            contact.begin()
+            contact.begin(getattr(self.system, "overlaps", {}))
         #: Warnings issued during steps.
         self.watch = Watch(self.contacts, rigid)
         #: Settings of the run, for checkpoints.

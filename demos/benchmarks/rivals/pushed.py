@@ -49,8 +49,9 @@ class PushedSystem(ABC):
         self.newton, self.consistent_tangent = newton, consistent_tangent
         self.made_of: object = None
         self.place()
+        self.overlaps: dict[int, float] = {}
         for pair in self.pairs:
-            check_initial(pair)
+            self.overlaps |= check_initial(pair)
             pair.activate_touching()
 
     # -- what a method has to say ------------------------------------------------------------------------------------------

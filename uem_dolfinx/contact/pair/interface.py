@@ -47,7 +47,6 @@ class Interface(Readings):
         trial: state of the present iteration.
         committed: state of the last step.
         kinematics: of the contactors, for the trial state; available after ``project``.
-        initial_overlap: depth of the deepest contactor inside the target before the first step, a length.
         heats: heat flow, one object per conductance.
     """
 
@@ -65,7 +64,7 @@ class Interface(Readings):
         max_penetration: float,
     ):
         self.config, self.nodes, self.discretisation, self.friction, self.tie = config, nodes, discretisation, friction, tie
-        self.name, self.max_penetration, self.initial_overlap = name, max_penetration, 0.0
+        self.name, self.max_penetration = name, max_penetration
         state = PairState.initial(n := len(nodes), g := config.gdim)
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
         self.trial = self.committed = replace(state, friction=along, bond=bond)

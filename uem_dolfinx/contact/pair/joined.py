@@ -71,10 +71,9 @@ class JoinedInterface(Interface):
 
     def part(self) -> list[Interface]:
         """The separate interfaces of the contacts, in their committed states; call ``project`` afterwards (collective)."""
-        for k, (pair, member) in enumerate(zip(self.own, self.members)):
+        for k, pair in enumerate(self.own):
             if pair.friction is not None:
                 pair.friction.free = self.discretisation.free[self.rows_of[k]]
-            pair.initial_overlap = member.initial_overlap
             pair.remember(self.state_of(k, self.committed))
             pair.trial = self.state_of(k, self.trial)
         return self.own

@@ -31,7 +31,6 @@ class Member(Interface):
         self.joined, self._k, self._rows = whole, k, whole.rows_of[k]
         self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
         self.name, self.max_penetration, self.tie, self.heats = own.name, own.max_penetration, None, []
-        self.initial_overlap = own.initial_overlap
         self._known: tuple[Kinematics, PairState, Kinematics] | None = None
 
     @property

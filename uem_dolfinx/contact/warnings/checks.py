@@ -45,8 +45,11 @@ SLIM = 3.0
 SLIPPED = 0.05
 
 
-def check_initial(pair: Interface) -> None:
+def check_initial(pair: Interface) -> dict[int, float]:
     """Refuse an initial penetration beyond the bound, and warn of any other (collective).
+
+    Returns:
+        Depth of the deepest contactor of each contact with contactors inside, a length, by ``id`` of its interface.
 
     Raises:
         PenetrationError: naming the deepest node of the first rank with such a node.
@@ -54,10 +57,8 @@ def check_initial(pair: Interface) -> None:
     gap = np.where(pair.off, np.inf, pair.kinematics.projection.gap)
     error = None
     if len(pair.members) > 1:
-        if reduced(pair.config.comm, bool((gap < -TOUCHING * pair.config.size).any()), op=MPI.LOR):
-            for one in pair.members:
-                check_initial(one)
-        return
+        some = reduced(pair.config.comm, bool((gap < -TOUCHING * pair.config.size).any()), op=MPI.LOR)
+        return {key: depth for one in (pair.members if some else ()) for key, depth in check_initial(one).items()}
     if len(gap) and gap.min() < -pair.max_penetration:
         i = int(gap.argmin())
         error = PenetrationError(
@@ -69,12 +70,11 @@ def check_initial(pair: Interface) -> None:
     inside = gap < -TOUCHING * pair.config.size
     depth = reduced(pair.config.comm, float(-gap.min(initial=0.0)), op=MPI.MAX)
     count = reduced(pair.config.comm, int(inside.sum()))
-    if count:
-        pair.initial_overlap = depth
-        logger.warning(
-            "%s: %d contactors start up to %.4g inside the target; the first step presses the bodies apart by this interference",
-            pair.name, count, pair.initial_overlap,
-        )  # fmt: skip
+    if not count:
+        return {}
+    words = "%s: %d contactors start up to %.4g inside the target; the first step presses the bodies apart by this interference"
+    logger.warning(words, pair.name, count, depth)
+    return {id(pair): depth}
 
 
 def check_prescribed(pair: Interface) -> None:

@@ -40,13 +40,23 @@ class WatchedContact(OfBothSides):
     target: Any
     _offsets: Offsets | None
 
-    def begin(self) -> None:
-        """Begin the checks, when the problem is complete (collective)."""
-        self.taken, self._slipped, self._on = True, False, True
+    def begin(self, overlaps: Mapping[int, float]) -> None:
+        """Begin the checks, when the problem is complete; ``overlaps`` as ``check_initial`` returns them (collective)."""
+        self.taken, self._slipped, self._on, self._overlap = True, False, True, 0.0
+        self.note_overlap(overlaps)
         #: The reported convex corner of the target, which reduces the contact force.
         self._corner: CornerInside | None = None
         #: Contactors that were past an end of the target at the start ``(n,)``.
         self.off_at_start: Bools = self.pair.off.copy()
+
+    @property
+    def initial_overlap(self) -> float:
+        """Largest penetration of contactors before the first step, a length; 0 without penetration."""
+        return self._overlap
+
+    def note_overlap(self, overlaps: Mapping[int, float]) -> None:
+        """Take its own of initial penetrations, see ``check_initial``."""
+        self._overlap = overlaps.get(id(self.pair), self._overlap)
 
     def take_pair(self, pair: Interface) -> None:
         """Replace the interface of the contact."""

@@ -8,9 +8,6 @@ from typing import Any
 from uem_dolfinx.contact.joining import part
 from uem_dolfinx.contact.pair.joined import JoinedInterface
 from uem_dolfinx.geometry.joined_rigid import motions_of_each
-from uem_dolfinx.solve.bodies.far_apart import FarApart
-from uem_dolfinx.solve.united.exchanges import Exchanges
-from uem_dolfinx.solve.united.rows import OverConstraints
 
 
 def part_contacts(problem: Any) -> None:
@@ -32,7 +29,5 @@ def part_contacts(problem: Any) -> None:
     remembered, motions = ([kept[id(pair)][i] for pair in after] for i in range(2))
     problem._before = replace(memory, pairs=remembered, motions=motions)
     problem.watch.begin()
-    system.pairs = pairs = [pair for pair in after if known[id(pair)][1]]
-    system.exchanges, system.far_apart = Exchanges(pairs), FarApart(system.config, pairs)
-    system.over_constraints = OverConstraints(system.config, pairs, system.linear)
-    system.floating.take(pairs, system.far_apart)
+    system.regroup([pair for pair in after if known[id(pair)][1]])
+    system.floating.take(system.pairs, system.far_apart)

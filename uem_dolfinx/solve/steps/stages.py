@@ -185,8 +185,7 @@ class Stage:
         for part in left if fresh else ():
             switch_off(part.pair)
         for part in come if fresh else ():
-            settle(part.pair)
-            switch_on(part.pair)
+            switch_on(part)
         if other or left or come or problem.linear is not None:
             assert isinstance(problem.system, BodySystem)
             problem.unite(step.loads, 0.0)

@@ -83,22 +83,27 @@ class BodySystem:
         self._multipliers: Array = np.zeros(0)  # of the equations of users, as last computed ``(m,)``
         self.take(pairs, linear)
         self.place()
-        for pair in self.pairs:
-            check_initial(pair)
+        #: Initial penetrations, see ``check_initial``.
+        self.overlaps = {key: depth for pair in self.pairs for key, depth in check_initial(pair).items()}
         for pair in self.near:
             pair.activate_touching()
 
     def take(self, pairs: Sequence[Interface], linear: UserRows | None) -> None:
         """Replace all pairs and equations of users, under the bodies' present conditions, from the next step on (collective)."""
+        self.linear = linear
+        self.regroup(pairs)
+        self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
+
+    def regroup(self, pairs: Sequence[Interface]) -> None:
+        """Take the contactors of the same contacts in other pairs, between two steps (collective)."""
         from uem_dolfinx.solve.bodies.far_apart import FarApart
 
-        self.pairs, self.linear = list(pairs), linear
+        self.pairs = list(pairs)
         self.rows: Rows | None = None  # equations of the last state
         self._here: Rows | None = None  # equations at the last projection, with its slip directions; None until needed
         self._look()
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
-        self.over_constraints = OverConstraints(self.config, self.pairs, linear)
-        self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
+        self.over_constraints = OverConstraints(self.config, self.pairs, self.linear)
         self.solver.condensed.beside = nodes_beside(self.config, self.pairs)
 
     def _look(self) -> None:
