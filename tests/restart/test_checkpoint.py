@@ -281,7 +281,7 @@ def test_moving_rigid_surface(sliding, coupling, folder):
     s, _, _, whole = pressed()
     lead(whole, range(1, 4))
     uem.write_checkpoint(folder / "run", whole.state())
-    gap = whole.pairs[0].gap.copy()
+    gap = whole.pairs[0].kinematics.gap.copy()
     lead(whole, range(4, 7))
     t, ball, contact, other = pressed()
     uem.read_checkpoint(folder / "run", other.state())
