@@ -401,12 +401,22 @@ class Sliding:
         tau, start, end, taken = self.step(state, committed, kinematics)
         slips = self.slipping(state) if self.wear is None else state.active & ~f.stick
         slipped = f.slipped + np.where(held[:, None], end, np.where(slips[:, None], self.frame.slip / share, 0.0))
-        self._last, worn = None, f.worn
-        if self.wear is not None:
-            slid = rubbing.force_times_way(self.frame, kinematics, (committed, state), tau, (start, end))
-            worn = worn + self.wear.depths(*slid)
+        self._last, worn = None, f.worn if self.wear is None else self._worn(state, committed, kinematics, tau, (start, end))
         now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken, worn=worn)
         return replace(state, friction=now)
+
+    def worn(self, state: PairState, committed: PairState, kinematics: Kinematics) -> Array:
+        """Wear depths at the end of the step, with the forces at its start and of the present state ``(n,)`` (collective)."""
+        tau, start, end, _ = self.step(state, committed, kinematics)
+        return self._worn(state, committed, kinematics, tau, (start, end))
+
+    def _worn(
+        self, state: PairState, committed: PairState, kinematics: Kinematics, tau: Array, ways: tuple[Array, Array]
+    ) -> Array:
+        assert self.wear is not None
+        return _of(committed).worn + self.wear.depths(
+            *rubbing.force_times_way(self.frame, kinematics, (committed, state), tau, ways)
+        )
 
     def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
         """Friction at a step's end, slips per unit of friction at start and end ``(n, gdim)``, and dissipation ``(n,)`` (collective)."""
@@ -418,11 +428,9 @@ class Sliding:
         tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope, end) * share, _of(state).tau)
         return tau, start, end, stick_slip.work(_of(committed).tau, tau, start, end, self.frame.cornered)
 
-    def begin_from(self, state: PairState) -> None:
-        """Begin a step from a state: discard the reference of slip, and increase gaps by the wear depth (collective)."""
+    def forget(self) -> None:
+        """Discard the reference of slip."""
         self._last = None
-        if self.wear is not None:
-            self.wear.apply(state)
 
     def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
         """Relative motions since the last step, per unit of friction at its start and at its end ``(n, gdim)`` (collective)."""

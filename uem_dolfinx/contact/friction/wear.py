@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
@@ -84,10 +87,9 @@ class Wear:
         nodal = self._at_facets(volume / self._integrals) @ self._to_nodes.T
         return np.asarray(self._config.to_owners(self._dofs.ravel(), nodal.ravel())[self._nodes] / self._count)
 
-    def apply(self, state: PairState) -> None:
-        """Increase gaps by the wear of a state; contactors must be placed again (collective)."""
-        assert state.friction is not None
-        self._lower(state.friction.worn)
+    def apply(self, worn: Array) -> None:
+        """Increase gaps by depths ``(n,)``; contactors must be placed again (collective)."""
+        self._lower(worn)
 
     def volume(self, state: PairState) -> float:
         """Worn volume of a state over all ranks (collective)."""
@@ -117,3 +119,16 @@ class Wear:
                 self._name,
                 count,
             )
+
+
+def wear_on(pairs: Sequence[Any]) -> bool:
+    """Increase the gaps of all pairs by their depths at the end of the present step; return whether any wear in it (collective)."""
+    wearing = [pair for pair in pairs if pair.friction is not None and pair.friction.wear is not None]
+    depths = [pair.friction.worn(pair.trial, pair.committed, pair.kinematics) for pair in wearing]
+    some = any(bool((now > pair.committed.friction.worn).any()) for pair, now in zip(wearing, depths))
+    if not wearing or not reduced(wearing[0].config.comm, some, op=MPI.LOR):
+        return False
+    for pair, now in zip(wearing, depths):
+        pair.friction.wear.apply(now)
+        pair.project()
+    return True

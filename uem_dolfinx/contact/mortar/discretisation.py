@@ -31,7 +31,7 @@ from uem_dolfinx.geometry.opposite import FACING, find_opposite
 from uem_dolfinx.geometry.overlaps import Planes, Segments, overlap
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.geometry.rigid import Motion
-from uem_dolfinx.geometry.search import LEAST_LEAN, MeshTarget
+from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import tangents
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
@@ -39,8 +39,7 @@ from uem_dolfinx.parallel import reduced
 #: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
 #: [convention; radians; test_mortar.py::test_parallel_facets]
 PARALLEL = 1e-10
-#: A rigid surface covers a facet if the cosine of the angle between its normal and the facet's reversed is larger at all points: the
-#: rows of small and fixed sliding are kept along the facet's normal.
+#: A rigid surface covers a facet if the cosine of the angle between its normal and the facet's reversed is larger at all points.
 #: [convention; cosine; test_mortar.py::test_rigid_surfaces_cover_what_faces_them]
 COVERS = 0.75
 #: One that it has covered before stays covered as long as this cosine is larger: a facet that turns with what covers it would else be
@@ -66,10 +65,8 @@ class Mortar(Contactors):
         #: Rows of the last placement, with the search and the states of contactors that they depend on; a search returns the same
         #: object while no node moves.
         self._united: tuple[Projection, Ints, WeightedRows] | None = None
-        #: Kept rows of a contact with small or fixed sliding.
-        self._kept: WeightedRows | None = None
-        #: Motion of a rigid target at the time of these rows.
-        self._kept_at: Motion | None = None
+        #: Kept rows of a contact with small or fixed sliding, and what ``_follow`` needs with them.
+        self._kept: tuple[WeightedRows, Array, Array, Motion | None] | None = None
 
     # -- placement -------------------------------------------------------------------------------------------------------
 
@@ -90,15 +87,11 @@ class Mortar(Contactors):
         elif self._kept is None:
             nearest = self.take_feet(points)
             rows = self._unite(nearest, points, np.zeros(self.surface.dofs.shape, dtype=bool))
-            self._kept, self._kept_at = rows, self.target.motion
-            if self.offset is not None and not self.target.n_nodes:
-                # keep heights over a rigid surface, from which present offsets are subtracted
-                self._kept = replace(
-                    rows, equations=replace(rows.equations, gap=rows.equations.gap + self._weighted_offset(rows))
-                )
+            whole = rows.plain.gap if self.offset is None else rows.plain.gap + self._weighted_offset(rows)
+            self._kept = rows, self.config.x[: self.config.n_owned].copy(), whole, self.target.motion
         else:
             nearest = self.on_target(points, self.anchor)
-            rows = self._follow(self._kept, nearest)
+            rows = self._follow(*self._kept)
         gap = rows.length * rows.equations.gap
         seen: Any = replace(nearest, gap=gap, normal=rows.plain.direction)  # type: ignore[type-var]
         if self.target.n_nodes:
@@ -116,40 +109,26 @@ class Mortar(Contactors):
         can[equations.row[np.abs(equations.coefficients * free).max(axis=1, initial=0.0) > MOSTLY_PRESCRIBED]] = True
         return can
 
-    def _follow(self, rows: WeightedRows, nearest: Projection) -> WeightedRows:
-        """The kept rows in the current configuration (collective)."""
-        n = self.config.n_owned
-        if self.target.n_nodes:
-            gap = self._along(rows, self.config.x[:n])
-        else:
-            assert self.anchor is not None
-            rows = self._turned(rows)
-            eq = rows.equations
-            # change of height as a displacement along the rows
-            lean = np.einsum("ng,ng->n", nearest.normal, eq.direction)
-            way = np.zeros((n, self.config.gdim))
-            way[self.nodes] = ((nearest.height - self.anchor.height) / np.maximum(lean, LEAST_LEAN))[:, None] * eq.direction
-            gap = eq.gap + self._along(rows, way)
+    def _follow(self, rows: WeightedRows, then: Array, gap: Array, before: Motion | None) -> WeightedRows:
+        """The kept rows in the current configuration: gaps change along them (collective).
+
+        Args:
+            rows: kept.
+            then: positions of the owned nodes at that time ``(n_owned, gdim)``.
+            gap: of the plain rows at that time, without offsets ``(n,)``.
+            before: motion of a rigid target at that time.
+        """
+        now = self.target.motion
+        if now is not before:
+            still = Motion.none(self.config.gdim)
+            now, before = now or still, before or still
+            then, Q = now.carry(before.back(then)), now.Q @ before.Q.T
+            rows = rows.turned(Q)
+        moved = GapRows.along_normals(self.config, rows.equations, rows.length, self.free)
+        gap = gap + rows.length * moved.along(self.config.x[: self.config.n_owned] - then)
         if self.offset is not None:
             gap = gap - self._weighted_offset(rows)
-        moved = replace(rows.equations, gap=gap)
-        return replace(rows, equations=moved, plain=moved, normal=moved.direction)
-
-    def _along(self, rows: WeightedRows, values: Array) -> Array:
-        """Left sides of kept rows for the owned nodes' ``values (n_owned, gdim)``: ``(n,)`` (collective)."""
-        eq, seam = rows.equations, self.elimination.seam
-        found = GapRows.along_normals(self.config, eq, np.ones(len(eq)), self.free).along(values)
-        return np.asarray(found + seam.apart(self.nodes, rows.side, values).sum(axis=1))
-
-    def _turned(self, rows: WeightedRows) -> WeightedRows:
-        """Kept rows, rotated with a rigid target."""
-        now, then = self.target.motion, self._kept_at
-        if now is then:
-            return rows
-        still = Motion.none(self.config.gdim)
-        Q = (now or still).Q @ (then or still).Q.T
-        eq = replace(rows.equations, direction=rows.equations.direction @ Q.T, coefficients=rows.equations.coefficients @ Q.T)
-        return replace(rows, equations=eq, side=rows.side @ Q.T)
+        return rows.at_gaps(gap)
 
     # -- rows ------------------------------------------------------------------------------------------------------------
 
@@ -174,22 +153,31 @@ class Mortar(Contactors):
         segments, pairs, to_gap, N, nodes, y, shape_operator, facing = pieces
         phi = surface.shape.functions(segments.xi)
         b = phi if surface.shape.degree == 1 else self.basis.at(segments.xi)
-        radius, offset = None, None
+        radius = None
         if config.axisymmetric:
             radius = np.einsum("qa,qa->q", phi, x[facets][pairs[segments.pair], :, 0])
             segments = replace(segments, weight=2 * np.pi * radius * segments.weight)
-        dofs, offsets = surface.dofs[facets], self._offsets(facets)
-        if offsets is not None:
-            offset = np.einsum("qa,qa->q", phi, offsets[pairs[segments.pair]])
-        covered = Covered.of(segments, b, N, pairs, self.shares(planes.size, x[facets]), offset)
-        ratio = self.covered_part(dofs, covered)[1]
-        duals = dual_functions(covered, self.precedence(ratio[dofs], dofs), before[facets])
-        other = self.target.shape if isinstance(self.target, MeshTarget) else None
-        at = SegmentPoints(
-            segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
-            surface.shape, other, x[facets], y, surface.sign[facets], shape_operator, radius, offsets,
-        )  # fmt: skip
-        rows = self._gather(at, facets, ratio[self.nodes], self.stretch(facets, planes.size), nearest)
+        dofs = surface.dofs[facets]
+        full, stretch = self.shares(planes.size, x[facets]), self.stretch(facets, planes.size)
+
+        def less(offsets: Array | None) -> WeightedRows:
+            """Rows of the gaps less offsets at the facets' nodes ``(m, nn)``."""
+            offset = None if offsets is None else np.einsum("qa,qa->q", phi, offsets[pairs[segments.pair]])
+            covered = Covered.of(segments, b, N, pairs, full, offset)
+            ratio = self.covered_part(dofs, covered)[1]
+            duals = dual_functions(covered, self.precedence(ratio[dofs], dofs), before[facets])
+            other = self.target.shape if isinstance(self.target, MeshTarget) else None
+            at = SegmentPoints(
+                segments, pairs, surface.nodes[facets], nodes, planes, duals, covered, b, phi, N, to_gap,
+                surface.shape, other, x[facets], y, surface.sign[facets], shape_operator, radius, offsets,
+            )  # fmt: skip
+            return self._gather(at, facets, ratio[self.nodes], stretch, nearest)
+
+        rows = less(offsets := self._offsets(facets))
+        if self.sliding != "finite":
+            # kept areas do not grow: the derivatives are those of gaps that are closed in the mean
+            heights = config.from_owners(self.nodes, self.heights(rows)[:, None], dofs.ravel()).reshape(dofs.shape)
+            rows = less(heights if offsets is None else heights + offsets).at_gaps(rows.plain.gap)
         return replace(rows, facing=facing)
 
     def covered_part(self, dofs: Indices, covered: Covered) -> tuple[Array, Array]:
@@ -321,11 +309,10 @@ class Mortar(Contactors):
         value = np.concatenate([value, nearest.weights[alone][k, a, None] * nearest.normal[alone][k]])
         gap = np.where(is_covered, gap / scale, nearest.gap)
         variation: Terms = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, config.gdim)))
-        side = self.elimination.sides(own, on_facet) / scale[:, None]
         length, parts = np.ones(n), itself[:, :, None] * normal[:, None]
         plain_parts = parts
         plain = equations = UnitingEquations(self.nodes, direction, gap, np.zeros(n, dtype=bool), row, term, value)
-        if self.sliding == "finite" and reduced(config.comm, bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
+        if reduced(config.comm, bool((np.abs(at.tilt) > PARALLEL).any()), op=MPI.LOR):
             variation, more = self.elimination.variation(at, scale, plain)
             parts = parts + more
             equations, length = self.elimination.derivatives(plain, variation)
@@ -349,7 +336,7 @@ class Mortar(Contactors):
             near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]
             weights = np.concatenate([r, alone[k]]), np.concatenate([t, near[0]]), np.concatenate([w[:, 0], near[1]])
         return WeightedRows(
-            sharing, side, equations, length, plain, at, facets, is_covered, ratio, size / sharing, stretch, share, weights,
+            sharing, equations, length, plain, at, facets, is_covered, ratio, size / sharing, stretch, share, weights,
             frictionless, slope, push, parts, whole,
         )  # fmt: skip
 

@@ -90,6 +90,18 @@ class Contactors(OnTarget):
         now, then = (self.elimination.seam.sums(self.config.to_owners(dofs.ravel(), own.ravel()))[self.nodes] for own in shares)
         return np.where(then > 0, now / np.where(then > 0, then, 1.0), 1.0)
 
+    def heights(self, rows: WeightedRows) -> Array:
+        """Nodal heights whose means, weighted with dual functions, equal the means of the gaps (collective).
+
+        At degree 2 they are first computed in the Bernstein basis, and then converted to nodal values.
+        """
+        dofs = self.surface.dofs
+        means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
+        at = self.config.from_owners(self.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
+        nodal = at @ np.linalg.inv(self.basis.T).T
+        total, count = (self.config.to_owners(dofs.ravel(), values.ravel()) for values in (nodal, np.ones(dofs.shape)))
+        return np.asarray(total[self.nodes] / count[self.nodes])
+
 
 @dataclass(frozen=True)
 class MortarKinematics(PlacedOnTarget):
@@ -196,16 +208,8 @@ class MortarKinematics(PlacedOnTarget):
         return PressureMap(rows.share / rows.length, known=rows.covered, area=area, stretch=stretch)
 
     def heights(self) -> Array:
-        """Nodal heights whose means, weighted with dual functions, equal the means of the gaps (collective).
-
-        At degree 2 they are first computed in the Bernstein basis, and then converted to nodal values.
-        """
-        of, rows, dofs = self.of, self.rows, self.of.surface.dofs
-        means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
-        at = of.config.from_owners(of.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
-        nodal = at @ np.linalg.inv(of.basis.T).T
-        total, count = (of.config.to_owners(dofs.ravel(), values.ravel()) for values in (nodal, np.ones(dofs.shape)))
-        return np.asarray(total[of.nodes] / count[of.nodes])
+        """Nodal heights of the rows (collective)."""
+        return self.of.heights(self.rows)
 
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """Means by the integrals of the dual functions over the covered part; values at the nodes of other contactors (collective)."""

@@ -49,7 +49,6 @@ class WeightedRows:
 
     Attributes:
         sharing: number of contactors with the same row, of which each has an equal part of the force, see ``Seam`` ``(n,)``.
-        side: part of the plain row's direction that belongs to the contactor itself, not to others with the same row ``(n, gdim)``.
         equations: in the order of the contactors, all inactive. Their left sides are the derivatives of the gaps.
         length: divisors of these equations ``(n,)``.
         plain: the same equations with only the derivatives along the normals of the contactor's facets.
@@ -73,7 +72,6 @@ class WeightedRows:
     """
 
     sharing: Array
-    side: Array
     equations: UnitingEquations
     length: Array
     plain: UnitingEquations
@@ -91,6 +89,19 @@ class WeightedRows:
     parts: Array | None = None
     whole: Array | None = None
     facing: Ints | None = None
+
+    def at_gaps(self, gap: Array) -> WeightedRows:
+        """The rows with other gaps of the plain ones ``(n,)``."""
+        plain, equations = replace(self.plain, gap=gap), replace(self.equations, gap=gap / self.length)
+        return replace(self, equations=equations, plain=plain)
+
+    def turned(self, Q: Array) -> WeightedRows:
+        """The rows, rotated by ``Q (gdim, gdim)`` with a rigid target."""
+        plain, equations = (
+            replace(eq, direction=eq.direction @ Q.T, coefficients=eq.coefficients @ Q.T) for eq in (self.plain, self.equations)
+        )
+        normal = None if self.normal is None else self.normal @ Q.T
+        return replace(self, equations=equations, plain=plain, normal=normal)
 
 
 class Elimination:

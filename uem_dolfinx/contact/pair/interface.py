@@ -303,14 +303,15 @@ class Interface(Readings):
         self.committed = replace(fresh, at_end=ends.held(fresh))
         self.restore()
         self.discretisation.commit()
-        if self.friction is not None:
-            self.friction.begin_from(self.committed)
 
     def restore(self) -> None:
         """Go back to the committed state; call ``project`` afterwards."""
         self.trial = self.committed
         if self.tie is not None:
             self.tie.lose()
+        if self.friction is not None and self.friction.wear is not None:
+            assert self.committed.friction is not None
+            self.friction.wear.apply(self.committed.friction.worn)
 
     def remember(self, state: PairState) -> None:
         """Return to a committed state; call ``project`` afterwards, with bodies and target at their positions of that time."""
@@ -320,7 +321,7 @@ class Interface(Readings):
         self.search()
         self.discretisation.commit()
         if self.friction is not None:
-            self.friction.begin_from(self.committed)
+            self.friction.forget()
         self.restore()
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:

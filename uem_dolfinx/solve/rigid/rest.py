@@ -19,6 +19,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.arrays import AnyArray, Array
+from uem_dolfinx.contact.friction.wear import wear_on
 from uem_dolfinx.errors import ConvergenceError, FloatingBodyError, UEMError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.log import logger
@@ -79,6 +80,8 @@ class _Drag:
 def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any, system: Any) -> list[Any]:
     """Converge; if bodies without friction that only contact holds do not come to rest, once more by a decaying drag (collective).
 
+    Surfaces wear by the forces at both ends of the step (Heun's method): it converges once more on the worn ones, but not along an arc.
+
     Args:
         problem: a ``UnitedProblem`` with the values that its Dirichlet conditions prescribe.
         start: see ``UnitedProblem.attempt``.
@@ -91,13 +94,15 @@ def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any, sy
     """
     converge = partial(problem.converge, problem.bodies, system, start, fraction, along)
     try:
-        return converge()
+        history: list[Any] | None = converge()
     except (ConvergenceError, FloatingBodyError) as error:
         problem.watch.advise(error)
         history = _rest(problem, converge) if along is None and _may_rest(problem) else None
         if history is None:
             raise error
-        return history
+    assert history is not None
+    wear = along is None and wear_on(problem.interfaces)
+    return [*history, *converge()] if wear else history
 
 
 def _may_rest(problem: Any) -> bool:
