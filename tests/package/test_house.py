@@ -118,8 +118,8 @@ def test_imports_point_one_way():
 
 #: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
 BUDGETS = {
-    "members of the seam": 26, "members of Interface": 50, "heuristics": 14, "arrows within contact": 75, "arrows within solve": 39,
-    "lines of the package": 58_941,
+    "members of the seam": 26, "members of Interface": 49, "heuristics": 14, "arrows within contact": 75, "arrows within solve": 39,
+    "lines of the package": 58_897,
 }  # fmt: skip
 
 
@@ -147,9 +147,7 @@ def counts():
     """What the budgets count."""
     return {
         "members of the seam": sum(len(members("contact/seam/placement.py", name)) for name in ("Kinematics", "Discretisation")),
-        "members of Interface": len(
-            members("contact/pair/interface.py", "Interface") | members("contact/pair/readings.py", "Readings")
-        ),
+        "members of Interface": len(members("contact/pair/interface.py", "Interface")),
         "heuristics": sum(row.kind == "heuristic" for row in thresholds.thresholds()),
         "arrows within contact": len(arrows("uem_dolfinx.contact")),
         "arrows within solve": len(arrows("uem_dolfinx.solve")),

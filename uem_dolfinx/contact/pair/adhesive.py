@@ -106,7 +106,7 @@ class AdhesiveInterface(SofteningInterface):
         return np.concatenate([nodes, more[0]]), np.concatenate([forces, more[1]])
 
     def pressing(self) -> tuple[Array, Array]:
-        """See ``Readings``; contact and attraction."""
+        """See ``Interface``; contact and attraction."""
         lam, tau = super().pressing()
         return lam + self._pull * self.kinematics.pressure_map(False).force, tau
 

@@ -181,7 +181,7 @@ class CohesiveInterface(SofteningInterface):
         return bonds if own is None else together(own, bonds)
 
     def displaced(self) -> float:
-        """See ``Readings``."""
+        """See ``Interface``."""
         size = np.linalg.norm(self.points, axis=1, ord=np.inf) if len(self.nodes) else np.zeros(0)
         stiff = np.abs(self._tangent).sum(axis=2).max(axis=1, initial=0.0)
         return float(np.sqrt(2.0 * reduced(self.config.comm, float(((stiff * size) ** 2).sum()))))

@@ -15,12 +15,12 @@ import numpy.typing as npt
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.law import FrictionLaw
-from uem_dolfinx.contact.pair.readings import Readings
 from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics, Traction
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, reduced
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.geometry.rigid import Motion
 
 
-class Interface(Readings):
+class Interface:
     """Contactors against one target.
 
     Args:
@@ -329,6 +329,90 @@ class Interface(Readings):
         if self.tie is not None:
             self.tie.from_checkpoint(kept, self.kinematics.ends.excluded(self.trial))
         self.remember(PairState.from_checkpoint(kept, self.target.facets_of))
+
+    # -- read access --------------------------------------------------------------------------------------------------------
+
+    @property
+    def members(self) -> Sequence[Any]:
+        """Interfaces of the single contacts: itself, unless several are treated together."""
+        return [self]
+
+    @property
+    def whole(self) -> Any:
+        """The joint interface that contains it: itself, unless several are treated together."""
+        return self
+
+    @property
+    def asked(self) -> bool:
+        """Whether any contactor on any rank was near the target in the last placement."""
+        return self.discretisation.asked
+
+    @property
+    def far(self) -> bool:
+        """Whether it is skipped, since the surfaces are separated."""
+        return all(self.discretisation.setting.far)
+
+    def set_offset(self, offset: Array | None) -> None:
+        """Set offsets ``(n,)``; contactors must be placed again (collective)."""
+        self.discretisation.set(offset=offset)
+
+    @property
+    def target(self) -> Target:
+        """Target of the contactors."""
+        return self.discretisation.target
+
+    @property
+    def points(self) -> Array:
+        """Current positions of the contactors ``(n, gdim)``."""
+        return self.config.here(self.nodes)
+
+    @property
+    def off(self) -> Bools:
+        """Contactors past an end of the target, barred, or tied ``(n,)``."""
+        out = self.kinematics.ends.excluded(self.trial)
+        return out if self.tie is None else out | self.tie.excluded
+
+    @property
+    def traction(self) -> Traction:
+        """Contact forces of the trial state."""
+        t = self.trial
+        return Traction(t.lam, t.nodal, t.force, None if t.friction is None else t.friction.tau, bond=t.bond)
+
+    def largest_gap_here(self) -> float:
+        """Largest gap of an active contactor of this rank, or distance from its anchor or tied position, a length."""
+        here = float(np.abs(self.kinematics.gap[self.trial.active & ~self.trial.redundant]).max(initial=0.0))
+        if self.friction is not None:
+            here = max(here, float(self.friction.distances(self.trial).max(initial=0.0)))
+        return here if self.tie is None else max(here, self.tie.largest_gap_here())
+
+    @property
+    def tied(self) -> Bools:
+        """Contactors tied permanently to the target in all components ``(n,)``."""
+        return np.zeros(len(self.nodes), dtype=bool) if self.tie is None else self.tie.tied
+
+    @property
+    def united(self) -> Bools:
+        """Contactors that are active or tied ``(n,)``."""
+        return self.trial.active | self.tied
+
+    def displaced(self) -> float:
+        """Norm of the forces that gaps would make by a displacement of the size of positions; 0 without stiffness (collective)."""
+        return 0.0
+
+    def pressing(self) -> tuple[Array, Array]:
+        """Normal ``(n,)`` and tangential forces ``(n, gdim)`` that belong to ``areas`` (collective)."""
+        t = self.trial
+        tau = 0.0 * t.force if t.friction is None else t.friction.tau
+        return (t.lam, tau) if self.tie is None else self.tie.pressing(t, self.kinematics.projection.normal, t.lam, tau)
+
+    def applied_forces(self) -> tuple[Ints, Array] | None:
+        """Loads that belong to the interface: global nodes ``(k,)`` and forces ``(k, gdim)``; None without loads (collective)."""
+        return None if self.tie is None else self.tie.applied_forces()
+
+    def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays ``(n, ...)`` for checkpoints, with facets as keys independent of the partition (collective)."""
+        kept = self.committed.to_checkpoint(self.target.keys_of)
+        return kept if self.tie is None else kept | self.tie.to_checkpoint()
 
 
 def name_at(pair: Interface, i: int) -> str:

@@ -6,13 +6,16 @@ Users access each of the contacts through its ``Member``.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
 
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.joined_nodes import JoinedNodes, JoinedSliding
 from uem_dolfinx.contact.pair.member import Member
-from uem_dolfinx.contact.pair.rows_of_states import joined, renumbered, rows, with_rows
-from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.contact.seam.state import FACETS, OF_FRICTION, FrictionState, PairState
 
 
 class JoinedInterface(Interface):
@@ -38,8 +41,8 @@ class JoinedInterface(Interface):
         self.rows_of = nodal.rows_of
         self._members: list[weakref.ref[Member]] = []
         here, surface = nodal.target.here, nodal.surface_of
-        parts = [renumbered(p.committed, lambda f, s=s: here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
-        self.trial = self.committed = joined(parts)
+        parts = [_renumbered(p.committed, lambda f, s=s: here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
+        self.trial = self.committed = _each(lambda _, *a: np.concatenate(a), *parts)
 
     @property
     def members(self) -> Sequence[Interface]:
@@ -55,19 +58,19 @@ class JoinedInterface(Interface):
     def state_of(self, k: int, state: PairState) -> PairState:
         """A contact's part of a state, with its own numbers of facets."""
         target, surface = self.discretisation.target, self.discretisation.surface_of[k]
-        return renumbered(rows(state, self.rows_of[k]), lambda facet: target.alone(facet, surface))
+        return _renumbered(_rows(state, self.rows_of[k]), lambda facet: target.alone(facet, surface))
 
     def with_state_of(self, k: int, state: PairState, part: PairState) -> PairState:
         """The state with a contact's part."""
         target, surface = self.discretisation.target, self.discretisation.surface_of[k]
-        return with_rows(state, self.rows_of[k], renumbered(part, lambda facet: target.here(facet, surface)))
+        return _with_rows(state, self.rows_of[k], _renumbered(part, lambda facet: target.here(facet, surface)))
 
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""
         before, far = self.committed, self.discretisation.setting.far[self.discretisation.label]
         super().commit()
         if far.any():
-            self.trial = self.committed = with_rows(self.committed, far, rows(before, far))
+            self.trial = self.committed = _with_rows(self.committed, far, _rows(before, far))
 
     def part(self) -> list[Interface]:
         """The separate interfaces of the contacts, in their committed states; call ``project`` afterwards (collective)."""
@@ -77,3 +80,40 @@ class JoinedInterface(Interface):
             pair.remember(self.state_of(k, self.committed))
             pair.trial = self.state_of(k, self.trial)
         return self.own
+
+
+def _each(change: Callable[..., Any], *states: PairState) -> PairState:
+    """The state whose arrays are made by ``change(name, *arrays)``, of arrays that all ``states`` have."""
+    first = states[0]
+    found = {
+        f.name: change(f.name, *(getattr(s, f.name) for s in states))
+        for f in fields(PairState)
+        if f.name != "friction" and getattr(first, f.name) is not None
+    }
+    if first.friction is not None:
+        of = [s.friction for s in states]
+        found["friction"] = FrictionState(
+            **{f.name: change(OF_FRICTION + f.name, *(getattr(o, f.name) for o in of)) for f in fields(FrictionState)}
+        )
+    return PairState(**found)
+
+
+def _rows(state: PairState, which: Any) -> PairState:
+    """The state of some contactors, by a slice or numbers ``(k,)``."""
+    return _each(lambda _, a: a[which], state)
+
+
+def _with_rows(state: PairState, which: Any, other: PairState) -> PairState:
+    """The state with some contactors, by a slice, numbers or a mask, replaced by another state of these."""
+
+    def changed(_: str, a: Any, b: Any) -> Any:
+        a = a.copy()
+        a[which] = b
+        return a
+
+    return _each(changed, state, other)
+
+
+def _renumbered(state: PairState, number: Callable[[Any], Any]) -> PairState:
+    """The state with facets renumbered by ``number (...)``."""
+    return _each(lambda name, a: number(a) if name in FACETS else a, state)

@@ -259,7 +259,7 @@ class SoftInterface(Interface):
         return float(np.abs(self.gaps() - self._at)[self._stiffness > 0.0].max(initial=0.0)) if self._acts else 0.0
 
     def displaced(self) -> float:
-        """See ``Readings``."""
+        """See ``Interface``."""
         size = np.linalg.norm(self.points, axis=1, ord=np.inf) if len(self.nodes) else np.zeros(0)
         return float(np.sqrt(2.0 * reduced(self.config.comm, float(((self._stiffness * size) ** 2).sum()))))
 
