@@ -416,5 +416,32 @@ def test_rows_past_an_end_are_left_out_first(past, left_out, size):
         row=np.array([0, 0, 1, 1]), followed=followed, coefficients=weights[:, None] * normals[[0, 0, 1, 1]],
     )  # fmt: skip
     space = SimpleNamespace(block=2, ask_owners=lambda node, values: values[node])
-    (group,) = _solve(space, equations, np.ones((4, 2), bool), np.zeros(2, bool))
+    (group,) = _solve(space, equations, np.ones((4, 2), bool), *np.zeros((2, 2), bool))
     assert list(group.redundant) == [left_out == 0, left_out == 1]
+
+
+@pytest.mark.parametrize("in_cone", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_forces_of_dependent_rows_do_not_pull(in_cone, seed):
+    """A rigid line presses nodes with more contactors than nodes: forces push and balance, or the rest lifts contactors off."""
+    rng, n = np.random.default_rng(seed), 5
+    x = np.linspace(0.0, n - 1.0, 3 * (n - 1) + 1)
+    weight = np.maximum(0.0, 1.0 - np.abs(x[:, None] - np.arange(n)))
+    A = np.zeros((len(x), len(x) + n, 2))
+    A[np.arange(len(x)), np.arange(len(x)), 1], A[:, len(x) :, 1] = 1.0, -weight
+    free = np.repeat(np.arange(len(x) + n) >= len(x), 2).reshape(-1, 2)
+    every = np.ones(len(x), bool)
+    group = _eliminate(A.copy(), np.zeros(len(x)), free, np.arange(len(x) + n), np.arange(len(x)), None, every)
+    assert group.redundant.sum() == len(x) - n
+    loads = weight.T @ np.where(rng.random(len(x)) < 0.3, rng.random(len(x)), 0.0) if in_cone else rng.normal(size=n)
+    least = np.linalg.pinv(weight.T) @ loads
+    assert least.min() < 0.0
+    lam = group.forces(np.linalg.lstsq(group.shares, least, rcond=None)[0])
+    left = weight.T @ np.maximum(lam, 0.0) - loads
+    if in_cone:
+        assert lam.min() >= -1e-14 and np.abs(left).max() < 1e-13
+    else:
+        # the loads that are left lift off the contactors that pull, and move none with a force
+        opens = weight @ left
+        assert (opens[lam < -1e-12] > 1e-12).all() and (lam < -1e-12).any()
+        assert np.abs(opens[lam > 1e-12]).max() < 1e-12 and opens.min() > -1e-12

@@ -19,6 +19,7 @@ from enum import IntEnum
 import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left, send
+from uem_dolfinx.algebra.nonnegative import least_squares
 from uem_dolfinx.algebra.rings import DEPENDENT, components
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
@@ -46,7 +47,8 @@ class Group:
 
     ``given (m,)`` are the numbers of the conflicting equations, ``redundant (m,)`` marks dropped ones. ``independent (k,)`` are of
     global nodes, on any rank; ``shares (m, k)`` maps forces of the independent equations to forces of the conflicting ones.
-    ``nodes (n_nodes,)`` are all nodes that the equations act on, ascending.
+    ``nodes (n_nodes,)`` are all nodes that the equations act on, ascending; ``movable (m, n)`` are the free components of the
+    conflicting equations, and ``pushing (m,)`` marks those with forces that cannot be negative.
     """
 
     given: Ints
@@ -54,6 +56,26 @@ class Group:
     shares: Array
     redundant: Bools
     nodes: Ints
+    movable: Array
+    pushing: Bools
+
+    def forces(self, mu: Array) -> Array:
+        """Forces of the conflicting equations ``(m,)`` from those of the independent ones ``(k,)``: the least, if none pulls.
+
+        Otherwise none pulls, if forces without a pull balance the same loads; else those pull whose contactors the loads lift off
+        while the others stay.
+        """
+        lam = self.shares @ mu
+        if not (lam[self.pushing] < -NEGLIGIBLE * np.abs(lam).max(initial=0.0)).any():
+            return lam
+        both = np.flatnonzero(~self.pushing)
+        A = np.concatenate([self.movable, -self.movable[both]])
+        loads = self.movable.T @ lam
+        x = least_squares(A.T, loads)
+        opened = self.movable @ (loads - A.T @ x)
+        lam, pulled = x[: len(lam)], self.pushing & (x[: len(lam)] <= 0.0)
+        lam[both] -= x[len(lam) :]
+        return np.where(pulled, np.minimum(opened, lam), lam)
 
     def rotated(self, rows: UnitingEquations) -> Group:
         """The group of the conflicting equations in other directions, with the same eliminated components.
@@ -79,7 +101,8 @@ class Group:
         B[k, pivot] -= own.direction
         row, column = np.nonzero((np.abs(B) > NEGLIGIBLE).any(axis=2))
         independent = replace(own, row=row, followed=nodes[column], coefficients=-B[row, column])
-        return replace(self, independent=independent, shares=self.shares @ solve.T)
+        # friction follows the forces along the normals, which other shares would change
+        return replace(self, independent=independent, shares=self.shares @ solve.T, pushing=np.zeros(m, dtype=bool))
 
 
 class IndependentEquations:
@@ -93,6 +116,7 @@ class IndependentEquations:
         free: components without Dirichlet condition of the owned nodes ``(n_owned, block)``.
         ring: mask of equations that follow each other in rings and depend on each other ``(m,)``, or None.
         firm: mask of equations that are never dropped, and depend on no other firm ones ``(m,)``, or None.
+        pushing: mask of equations with forces that cannot be negative ``(m,)``, or None.
 
     Attributes:
         equations: the independent ones.
@@ -102,7 +126,13 @@ class IndependentEquations:
     """
 
     def __init__(
-        self, space: Nodes, equations: UnitingEquations, free: Bools, ring: Bools | None = None, firm: Bools | None = None
+        self,
+        space: Nodes,
+        equations: UnitingEquations,
+        free: Bools,
+        ring: Bools | None = None,
+        firm: Bools | None = None,
+        pushing: Bools | None = None,
     ):
         self.redundant: Bools = np.zeros(len(equations), dtype=bool)
         self.undetermined: Bools = self.redundant
@@ -116,9 +146,9 @@ class IndependentEquations:
         self._conflicting = _with_neighbours(space, equations, conflicting)
         self._space, self._rank = space, _ranks_of_groups(space, equations, self._conflicting)
         together = self._gather(equations)
-        own = np.zeros(len(equations), dtype=bool) if firm is None else firm
-        (first,) = self._gathered.send(own[self._conflicting])
-        self._groups = _solve(space, together, free, first)
+        none = np.zeros(len(equations), dtype=bool)
+        masks = (none if mask is None else mask for mask in (firm, pushing))
+        self._groups = _solve(space, together, free, *self._gathered.send(*(mask[self._conflicting] for mask in masks)))
         self._scatter(equations)
 
     def rotated(self, equations: UnitingEquations) -> IndependentEquations:
@@ -181,14 +211,14 @@ class IndependentEquations:
         lam, redundant = np.zeros(total), np.zeros(total, dtype=bool)
         for group in self._groups:
             start, end = end, end + len(group.independent)
-            lam[group.given], redundant[group.given] = group.shares @ mu[start:end], group.redundant
+            lam[group.given], redundant[group.given] = group.forces(mu[start:end]), group.redundant
         given = np.empty(len(self._conflicting))
         given[~self._conflicting] = multipliers[:n]
         given[self._sent], self.redundant[self._sent] = self._gathered.back(lam, redundant)
         return given
 
 
-def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools) -> list[Group]:
+def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools, pushing: Bools) -> list[Group]:
     """Solve conflicting equations group by group, on the rank that has them (collective)."""
     node, place = np.unique(np.concatenate([rows.node, rows.followed]), return_inverse=True)
     movable = space.ask_owners(node, free.astype(float)) > 0
@@ -211,7 +241,7 @@ def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools) -> li
         np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
         np.add.at(A, (np.searchsorted(which, rows.row[terms]), at[len(which) :]), -rows.coefficients[terms])
         rank = np.where(firm[which], Rank.FIRM, np.where(past[which], Rank.PAST_END, Rank.WITHIN))
-        groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which, rank))
+        groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which, rank, pushing[which]))
     return groups
 
 
@@ -249,7 +279,9 @@ def _ranks_of_groups(space: Nodes, equations: UnitingEquations, conflicting: Boo
     return rank[label]
 
 
-def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: Ints | None = None) -> Group:
+def _eliminate(
+    A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: Ints | None = None, pushing: Bools | None = None
+) -> Group:
     """Gauss-Jordan elimination of ``A du = h`` in the free components, one direction of one node after the other.
 
     Rows are normalised first. A row depends on the chosen rows if its part orthogonal to all of them, which does not depend on the
@@ -257,7 +289,7 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
 
     In ``A (m, n_nodes, block)`` and ``free (n_nodes, block)`` each of the global nodes ``node (n_nodes,)`` has its block of columns;
     ``given (m,)`` are the numbers of these equations, ``h (m,)`` their right-hand sides; the lowest ``rank (m,)`` is eliminated
-    first, see ``Rank``.
+    first, see ``Rank``; those of ``pushing (m,)`` have no negative forces.
     """
     m, flat = len(A), (len(A), free.size)
     movable = (A * free).reshape(flat)
@@ -277,7 +309,7 @@ def _eliminate(A: Array, h: Array, free: Bools, node: Ints, given: Ints, rank: I
     independent = UnitingEquations(node[pivot], direction, -h[k], np.ones(len(k), bool), row, node[column], -terms[row, column])
     redundant = np.ones(m, dtype=bool)
     redundant[k] = False
-    return Group(given, independent, shares, redundant, node)
+    return Group(given, independent, shares, redundant, node, movable, ~redundant & False if pushing is None else pushing)
 
 
 def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: Ints) -> tuple[Ints, Ints, Array]:

@@ -335,7 +335,7 @@ class FloatingBodies:
         pairs = in_question(self._pairs)
         equations = [pair.equations() for pair in pairs]
         more = [] if self._linear is None else [self._linear.at_present(), *self._linear.sprung()]
-        rows = UnitingEquations.join([*(e.resisting.select(e.resisting.active) for e in equations), *more], g)
+        rows = UnitingEquations.join([*(_of_held(pair, e) for pair, e in zip(pairs, equations)), *more], g)
         # sticking contactors are held in all directions; contactors without friction may separate again
         firm = [(e.permanent | (pair.friction is not None))[e.resisting.active] for pair, e in zip(pairs, equations)]
         which = np.concatenate([np.zeros(0, bool), *firm, *(np.ones(len(e), bool) for e in more)])
@@ -438,3 +438,10 @@ def _activate(pair: Interface, closing: Ints) -> bool:
     active[now] = True
     pair.set_active(replace(pair.trial, active=active))
     return bool(reduced(pair.config.comm, len(now)))
+
+
+def _of_held(pair: Interface, equations: ContactRows) -> UnitingEquations:
+    """Active rows of an interface; contactors stay as far inside as the equations that replace theirs leave them."""
+    rows = equations.resisting
+    inside = equations.normal & pair.trial.redundant[equations.contactor] & (rows.gap < 0.0)
+    return replace(rows, gap=np.where(inside, 0.0, rows.gap)).select(rows.active)

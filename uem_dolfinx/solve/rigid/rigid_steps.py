@@ -9,7 +9,6 @@ and ``M v = f + R' lam`` with the contact forces ``lam >= 0``. If contact forces
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any
 
 from mpi4py import MPI
@@ -17,6 +16,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE
+from uem_dolfinx.algebra.nonnegative import least_squares
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.solve.rigid.rigid_motions import blocks_of, by_block
 
@@ -115,10 +115,9 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
     if scale == 0:
         return p, np.zeros(len(h))
     unit = G / size[:, None]
-    # nnls is fast, but not accurate to rounding in every SciPy; lsq_linear satisfies its bounds to rounding
     for quick, bound in ((True, h), (False, h), (False, np.minimum(h, 0.0))):
         d = (bound / size - unit @ p) / scale
-        lam = _nonnegative(np.vstack([unit.T, d]), quick)
+        lam = least_squares(np.vstack([unit.T, d]), np.append(np.zeros(len(p)), 1.0), quick)
         left = 1.0 - float(d @ lam)
         if left <= KEPT:
             continue
@@ -135,15 +134,3 @@ def nearest_point(p: Array, G: Array, h: Array) -> tuple[Array, Array]:
         if not quick:
             break
     return p + unit.T @ lam, lam / size
-
-
-def _nonnegative(E: Array, quick: bool) -> Array:
-    """``lam >= 0 (m,)`` that minimises ``|E lam - e|``, ``E (k + 1, m)``, where e is the last unit vector."""
-    from scipy.optimize import lsq_linear, nnls
-
-    e, most = np.append(np.zeros(len(E) - 1), 1.0), 30 * E.shape[1]
-    if quick:
-        # nnls raises after too many iterations
-        with suppress(RuntimeError):
-            return np.asarray(nnls(E, e, maxiter=most)[0])
-    return np.maximum(lsq_linear(E, e, (0.0, np.inf), "bvls", 1e-15, max_iter=most).x, 0.0)

@@ -116,7 +116,7 @@ class OverConstraints:
         return self._rigid.rewritten(equations.select(~last)), [equations.select(last)]
 
     def restrict(
-        self, equations: UnitingEquations, free: Bools, prescribed: Array
+        self, equations: UnitingEquations, free: Bools, prescribed: Array, pushing: Bools | None = None
     ) -> tuple[Restriction, IndependentEquations | None]:
         """P or Q of equations, and the resolution of their conflicts (collective).
 
@@ -124,11 +124,13 @@ class OverConstraints:
             equations: of all pairs together, followed by the equations of users.
             free: mask of free components ``(n_rows, gdim)``.
             prescribed: increments prescribed by Dirichlet conditions ``(n_rows, gdim)``.
+            pushing: mask of equations with forces that cannot be negative ``(m,)``, or None.
         """
         given, rigid = self.parted(equations)
         firm, g = np.arange(len(given)) >= len(given) - self._n_linear, prescribed.shape[1]
+        pushing = None if pushing is None else pushing[: len(given)]
         left = free if self._rigid is None else self._rigid.left(free)
-        independent = self._independent(given, left, None, firm) if self.contestable else None
+        independent = self._independent(given, left, None, firm, pushing) if self.contestable else None
         own = given if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
         every = joined(own, rigid, g)
@@ -139,13 +141,13 @@ class OverConstraints:
             return self._last, independent
         except DependentRingError as error:
             ring = error.rows[: len(own)] if independent is None else independent.of_given(error.rows[: len(own)])
-        independent = self._independent(given, left, ring, firm)
+        independent = self._independent(given, left, ring, firm, pushing)
         return Restriction(self._unknowns, joined(independent.equations, rigid, g), free, prescribed), independent
 
-    def _independent(self, given: UnitingEquations, free: Bools, ring: Bools | None, firm: Bools) -> IndependentEquations:
+    def _independent(self, given: UnitingEquations, free: Bools, *masks: Bools | None) -> IndependentEquations:
         from uem_dolfinx.algebra.dependent import IndependentEquations
 
-        return IndependentEquations(self._unknowns, given, free, ring, firm)
+        return IndependentEquations(self._unknowns, given, free, *masks)
 
 
 @dataclass(frozen=True)
@@ -288,7 +290,9 @@ def make_rows(
     whole = ContactRows.join(equations, [*united, *users], g)
     # the derivatives of the gaps determine the open motions of a body
     free = hold(ContactRows.join(equations, users, g) if united else whole)
-    Q, independent = over_constraints.restrict(whole.rows, free, prescribed)
+    pushing = [own.normal & (not pair.trial.has_law) for pair, own in zip(pairs, equations)]
+    pushing += [np.zeros(len(whole) - sum(map(len, equations)), dtype=bool)]
+    Q, independent = over_constraints.restrict(whole.rows, free, prescribed, np.concatenate(pushing))
     rotated = Q
     if whole.tilt is not None:
         test, last = over_constraints.parted(whole.Q)
