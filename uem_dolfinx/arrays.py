@@ -48,3 +48,43 @@ def cross_products(a: Array, b: Array) -> Array:
     """Cross products of 3D vectors ``a`` and ``b (..., 3)``; a faster ``numpy.cross``."""
     ahead, back = [1, 2, 0], [2, 0, 1]
     return np.asarray(a[..., ahead] * b[..., back] - a[..., back] * b[..., ahead])
+
+
+class NumbersOnly(np.ndarray):
+    """An array for functions of users, which refuses expressions of UFL, as Constants: NumPy would take them for lists without end."""
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        """As of other arrays; TypeError with an expression."""
+        _refuse_symbols(inputs)
+        if "out" in kwargs:
+            kwargs["out"] = tuple(map(plain, kwargs["out"]))
+        found = getattr(ufunc, method)(*map(plain, inputs), **kwargs)
+        return tuple(map(numbers_only, found)) if isinstance(found, tuple) else numbers_only(found)
+
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        """As of other arrays; TypeError with an expression."""
+        _refuse_symbols((*args, *kwargs.values()))
+        return super().__array_function__(func, types, args, kwargs)
+
+
+def _refuse_symbols(values: Any) -> None:
+    """TypeError for expressions of UFL among values and the items of lists."""
+    for one in values:
+        if hasattr(one, "ufl_shape"):
+            raise TypeError(
+                "an array meets a Constant or another expression of UFL: expected numbers, as c.value of a Constant c"
+            )
+        if isinstance(one, list | tuple):
+            _refuse_symbols(one)
+
+
+def numbers_only(value: Any) -> Any:
+    """An array as ``NumbersOnly``, and other objects as they are."""
+    return value.view(NumbersOnly) if type(value) is np.ndarray else value
+
+
+def plain(value: Any) -> Any:
+    """An array of ``NumbersOnly`` as an ordinary one, also in lists, and other objects as they are."""
+    if isinstance(value, list | tuple) and any(isinstance(one, NumbersOnly) for one in value):
+        return type(value)([plain(one) for one in value])
+    return value.view(np.ndarray) if isinstance(value, NumbersOnly) else value

@@ -12,13 +12,14 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it loads the MPI library
 
 import numpy as np
 
-from uem_dolfinx.arrays import AnyArray, Ints
+from uem_dolfinx import arrays
+from uem_dolfinx.arrays import AnyArray, Ints, numbers_only, plain
 from uem_dolfinx.errors import UEMError, UserFunctionError
 
 T = TypeVar("T")
@@ -109,11 +110,13 @@ def ask(what: str, f: Callable[..., T], *args: Any) -> T:
             Errors of the package, SystemExit, KeyboardInterrupt and others that are no Exception are not changed.
     """
     try:
-        return f(*args)
+        return cast(T, plain(f(*map(numbers_only, args))))
     except UEMError:
         raise
     except (Exception, GeneratorExit) as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
+        frames = traceback.extract_tb(error.__traceback__)
+        beside = arrays.__file__, "<__array_function__ internals>"
+        last = next((one for one in reversed(frames) if one.filename not in beside), frames[-1])
         raise UserFunctionError(
             f"{what} raised {type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno}); mend the function"
         ) from error

@@ -267,6 +267,35 @@ def test_expressions_in_place_of_numbers(make):
         refused(uem.InputTypeError, "expected", call)
 
 
+SYMBOLS = {
+    "a factor": lambda x, c: c * x[0],
+    "a factor behind": lambda x, c: x[0] * c,
+    "in a sum": lambda x, c: np.sin(x[0]) + c,
+    "an argument": lambda x, c: np.where(x[0] > 0.5, c, 0.0),
+    "in a list": lambda x, c: np.stack([x[0], [c] * x.shape[1]])[1],
+    "in place": lambda x, c: x[0].__imul__(c),
+}
+
+
+@pytest.mark.parametrize("how", SYMBOLS)
+def test_functions_that_mix_arrays_and_expressions(how):
+    """A Constant times an array never ended, within NumPy: an error with the line of the script."""
+    b = blocks(COMM, "triangle", 2, 2)
+    f, c = SYMBOLS[how], fem.Constant(b.scene.mesh, 0.5)
+
+    def solve(value, **more):
+        bcs = [*clamp(b.V, b.bottom), *([] if value is None else [uem.dirichlet(b.V, b.top, 1, value)])]
+        uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=bcs, **more).solve()
+
+    line = ("Constant", "test_inputs_beside.py, line")
+    refused(uem.UserFunctionError, line, lambda: solve(lambda x: f(x, c)))
+    refused(uem.UserFunctionError, line, lambda: solve(lambda x, s: s * f(x, c)))
+    plane = uem.RigidPlane((0.0, 2.0), (0.0, -1.0))
+    refused(uem.UserFunctionError, line, lambda: solve(None, contacts=[uem.Contact(b.top, plane, friction=lambda x: f(x, c))]))
+    # numbers in its place, and in-place work on the places, change nothing
+    solve(lambda x: f(x, float(c.value)))
+
+
 def test_a_list_of_expressions_as_value():
     """Components of a Dirichlet value may be numbers and expressions."""
     b = blocks(COMM, "triangle", 2, 2)

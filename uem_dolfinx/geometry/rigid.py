@@ -284,7 +284,7 @@ class RigidSurface(given.Sealed):
         """Values of a function at ``points (n, gdim)``, which must have this shape; it is not called without points."""
         if not len(points):
             return np.zeros(shape)
-        values = ask(f"{self.name}: {what}", lambda: np.asarray(f(points), dtype=float))
+        values = ask(f"{self.name}: {what}", lambda x: np.asarray(f(x), dtype=float), points)
         if values.shape != shape:
             raise InputError(
                 f"{self.name}: {what} returned the shape {values.shape} for points of the shape {points.shape}: expected {shape}, "

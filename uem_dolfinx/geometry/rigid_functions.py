@@ -6,11 +6,11 @@ The package always calls them with points ``(n, gdim)``. The shape returned by `
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, numbers_only
 
 #: Functions are asked about so many points at least: more than there are coordinates, so that shapes tell which axis is that of points.
 #: [format; points; test_rigid.py::test_functions_of_places]
@@ -64,7 +64,7 @@ def _places(points: Array) -> Array:
     x = np.zeros((3, max(n, LEAST_POINTS)))
     x[:g, :n] = points.T
     x[:, n:] = x[:, n - 1 : n]
-    return x
+    return cast(Array, numbers_only(x))
 
 
 def _rows(values: Array, n: int, g: int) -> Array:
