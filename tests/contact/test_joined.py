@@ -294,7 +294,7 @@ def test_friction_that_follows_a_temperature_is_not_joined():
     """Its values are evaluated at each placement, by each contact; Coulomb's that only differ in values are joined."""
 
     def joins(friction):
-        return joining._joins(SimpleNamespace(limits=SimpleNamespace(law=as_law(friction)), wear=None))
+        return joining._joins(SimpleNamespace(limits=SimpleNamespace(law=as_law(friction))))
 
     assert joins(0.3) and joins(lambda x, t: t * x[0]) and joins(uem.Coulomb(0.2, limit=3.0))
     assert not joins(uem.OfTemperature(lambda x, t, T: 0.1 * T, field=1)) and not joins(uem.Tresca(1.0))

@@ -66,12 +66,15 @@ def _takes_parts(contact: Contact) -> bool:
     from uem_dolfinx.geometry.search import MeshTarget
 
     law = as_law(contact.friction)
-    plain = not (
-        contact.tied or contact.adjust or contact.wears or contact.heats or contact.normal or contact.cohesion or contact.leak
-    )
+    plain = _plain(contact) and not contact.adjust
     nodal = isinstance(contact.pair.discretisation, NodeToSurface) and contact.coupling == "node_to_surface"
     meshed = isinstance(contact.pair.target, MeshTarget) and contact.contactor.dim == contact.config.tdim - 1
     return plain and nodal and meshed and not (law.per_area or isinstance(law.field, OfTemperature))
+
+
+def _plain(contact: Contact) -> bool:
+    """Whether contact is hard, without tie, wear, heat and a fluid."""
+    return not (contact.tied or contact.wears or contact.heats or contact.normal or contact.cohesion or contact.leak)
 
 
 def join_alike(contacts: Sequence[Contact]) -> None:
@@ -122,8 +125,7 @@ def _kind(contact: Contact) -> Hashable:
     rigid = isinstance(contact.target, RigidSurface)
     if not rigid and not (type(contact) is Contact and type(pair.target) is MeshTarget):
         return None
-    nodal = (type(pair), type(pair.discretisation)) == (Interface, NodeToSurface)
-    if not nodal or contact.further or contact.sliding != "finite" or pair.tie is not None or pair.heats:
+    if type(pair.discretisation) is not NodeToSurface or contact.further or contact.sliding != "finite" or not _plain(contact):
         return None
     if pair.friction is not None and not _joins(pair.friction):
         return None
@@ -131,6 +133,6 @@ def _kind(contact: Contact) -> Hashable:
 
 
 def _joins(friction: Sliding) -> bool:
-    """Whether friction is Coulomb's law, independent of temperature, and without wear."""
+    """Whether friction is Coulomb's law, independent of temperature."""
     law = friction.limits.law
-    return type(law) is Coulomb and not isinstance(law.field, OfTemperature) and friction.wear is None
+    return type(law) is Coulomb and not isinstance(law.field, OfTemperature)

@@ -38,7 +38,6 @@ class JoinedInterface(Interface):
         friction = JoinedSliding(sliding, nodal) if sliding else None
         super().__init__(first.config, nodal.nodes, nodal, friction, name=first.name, max_penetration=first.max_penetration)
         self.own = list(own)
-        self.rows_of = nodal.rows_of
         self._members: list[weakref.ref[Member]] = []
         here, surface = nodal.target.here, nodal.surface_of
         parts = [_renumbered(p.committed, lambda f, s=s: here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
@@ -58,16 +57,16 @@ class JoinedInterface(Interface):
     def state_of(self, k: int, state: PairState) -> PairState:
         """A contact's part of a state, with its own numbers of facets."""
         target, surface = self.discretisation.target, self.discretisation.surface_of[k]
-        return _renumbered(_rows(state, self.rows_of[k]), lambda facet: target.alone(facet, surface))
+        return _renumbered(_rows(state, self.discretisation.rows_of[k]), lambda facet: target.alone(facet, surface))
 
     def with_state_of(self, k: int, state: PairState, part: PairState) -> PairState:
         """The state with a contact's part."""
         target, surface = self.discretisation.target, self.discretisation.surface_of[k]
-        return _with_rows(state, self.rows_of[k], _renumbered(part, lambda facet: target.here(facet, surface)))
+        return _with_rows(state, self.discretisation.rows_of[k], _renumbered(part, lambda facet: target.here(facet, surface)))
 
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""
-        before, far = self.committed, self.discretisation.setting.far[self.discretisation.label]
+        before, far = self.committed, self.discretisation.setting.far[self.discretisation.setting.label]
         super().commit()
         if far.any():
             self.trial = self.committed = _with_rows(self.committed, far, _rows(before, far))
@@ -76,7 +75,7 @@ class JoinedInterface(Interface):
         """The separate interfaces of the contacts, in their committed states; call ``project`` afterwards (collective)."""
         for k, pair in enumerate(self.own):
             if pair.friction is not None:
-                pair.friction.free = self.discretisation.free[self.rows_of[k]]
+                pair.friction.free = self.discretisation.free[self.discretisation.rows_of[k]]
             pair.remember(self.state_of(k, self.committed))
             pair.trial = self.state_of(k, self.trial)
         return self.own

@@ -26,9 +26,6 @@ class JoinedNodes(NodeToSurface):
 
     Args:
         own: discretisations of the contacts.
-
-    Attributes:
-        label: number of the contact of each contactor ``(n,)``.
     """
 
     #: A ``JoinedTarget`` or ``JoinedRigid``.
@@ -36,7 +33,7 @@ class JoinedNodes(NodeToSurface):
 
     def __init__(self, own: Sequence[NodeToSurface]):
         first = own[0]
-        self.label: Ints = np.repeat(np.arange(len(own)), [len(one.nodes) for one in own])
+        label: Ints = np.repeat(np.arange(len(own)), [len(one.nodes) for one in own])
         ends = np.cumsum([0, *(len(one.nodes) for one in own)])
         #: Contactors of each contact.
         self.rows_of = [slice(a, b) for a, b in pairwise(ends.tolist())]
@@ -47,12 +44,12 @@ class JoinedNodes(NodeToSurface):
         target: Any = JoinedRigid([one.target for one in own], self.rows_of)
         if first.target.n_nodes:
             facets = JoinedFacets(first.config, list(distinct.values()))
-            target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[self.label])
+            target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[label])
         how: dict[str, Any] = {"free": first.setting.free, "sliding": first.sliding, "thickness": first.thickness}
         super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
         self._own = own
         none = np.zeros(len(own), dtype=bool)
-        self.set(far=none, mutual=none, label=self.label)
+        self.set(far=none, mutual=none, label=label)
         if any(one.offset is not None for one in own):
             self.set(offset=np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
 
@@ -62,11 +59,11 @@ class JoinedNodes(NodeToSurface):
         for one in getattr(self, "_own", ()) if "free" in changed else ():
             one.set(free=changed["free"])
         if "far" in changed and self.target.n_nodes:
-            self.target.asked = ~changed["far"][self.label]
+            self.target.asked = ~changed["far"][self.setting.label]
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
         """See ``OnTarget``; only for contacts with offsets."""
-        i = np.flatnonzero(np.array([one.offset is not None for one in self._own])[self.label])
+        i = np.flatnonzero(np.array([one.offset is not None for one in self._own])[self.setting.label])
         assert self.offset is not None
         return found.with_those(i, found.take(i).across_edges(points[i], self.offset[i]))
 
@@ -106,7 +103,7 @@ class JoinedSliding(Sliding):
     """
 
     def __init__(self, own: Sequence[Sliding], discretisation: JoinedNodes):
-        first, label = own[0], discretisation.label
+        first, label = own[0], discretisation.setting.label
         ends = np.cumsum([0, *(len(one.value) for one in own)])
 
         def areas(normal: Array | None) -> Array:

@@ -28,7 +28,7 @@ class Member(Interface):
     """
 
     def __init__(self, whole: Any, k: int, own: Interface):
-        self.joined, self._k, self._rows = whole, k, whole.rows_of[k]
+        self.joined, self._k, self._rows = whole, k, whole.discretisation.rows_of[k]
         self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
         self.name, self.max_penetration, self.tie, self.heats = own.name, own.max_penetration, None, []
         self._known: tuple[Kinematics, PairState, Kinematics] | None = None
@@ -144,5 +144,5 @@ class Member(Interface):
         assert self.friction is not None
         self.friction.set(law, value)
         own = [pair.friction for pair in self.joined.own if pair.friction is not None]
-        every = JoinedLaw([one.limits.law for one in own], self.joined.discretisation.label)
+        every = JoinedLaw([one.limits.law for one in own], self.joined.discretisation.setting.label)
         self.joined.set_friction(every, np.concatenate([one.value for one in own]), known)
