@@ -245,6 +245,14 @@ def test_expressions_in_place_of_numbers(make):
         lambda: uem.Step("a", loads={fem.Constant(mesh, 0.0): one}),
         lambda: uem.Newton(rtol=one),
         lambda: uem.ViscousFriction(one),
+        *(
+            lambda law=law: uem.Contact(b.high, plane, friction=law)
+            for law in (uem.Coulomb(one), uem.Tresca(one), uem.Thirion(one, 1.0), uem.Stribeck(one, 0.1))
+        ),
+        lambda: uem.Step("a", friction={uem.Contact(b.high, plane, friction=0.1): uem.Tresca(one)}),
+        lambda: uem.OfTemperature(one, field=0),
+        lambda: uem.Contact(b.high, plane, coupling=one),
+        lambda: uem.UnitedProblem(linear(b.u, 1.0), b.u, method=one),
         lambda: uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), load={fem.Constant(mesh, 0.0): one}),
     ]
     # Constants may be values of these

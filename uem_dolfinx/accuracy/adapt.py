@@ -139,10 +139,10 @@ def adapt(
 
             print(uem.adapt(make, tolerance=0.02))
     """
-    given.kind("make", make, callable(make), "a function of the size of cells that returns a UnitedProblem")
-    given.kind("goal", goal, goal is None or callable(goal), "a function of the problem that returns a UFL form, or None")
+    given.kind("make", make, given.function(make), "a function of the size of cells that returns a UnitedProblem")
+    given.kind("goal", goal, goal is None or given.function(goal), "a function of the problem that returns a UFL form, or None")
     for name, one in (("solve", solve), ("solve_again", solve_again)):
-        given.kind(name, one, one is None or callable(one), "a function of the problem, or None")
+        given.kind(name, one, one is None or given.function(one), "a function of the problem, or None")
     if (tolerance is None) == (cells is None):
         raise InputError("adapt: expected either a tolerance or a number of cells")
     tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))

@@ -152,7 +152,7 @@ class Periodic(given.Sealed):
     ):
         self._follower, self._leader = follower, leader
         self.places = [follower, leader]
-        self._map = given.kind("map", map, map is None or callable(map), "a function of places (n, gdim), or None")
+        self._map = given.kind("map", map, map is None or given.function(map), "a function of places (n, gdim), or None")
         #: Rotation of the components, or None.
         self.turn = None if turn is None else _rotation(turn)
         self.b = checked_value("jump", jump, None)

@@ -152,7 +152,7 @@ class Contact(WatchedContact, given.Sealed):
             rigid = hasattr(given.kind("target", target, True, "a part of a mesh, or a rigid surface"), "project")
             swap = "a rigid surface can only be the target: swap the two"
             given.kind("contactor", contactor, not hasattr(contactor, "project"), "a part of a mesh", swap)
-            if not callable(coupling):
+            if not given.function(coupling):
                 coupling = given.word("coupling", coupling, COUPLINGS)
             sliding = given.word("sliding", sliding, ("finite", "small", "fixed"))
             normals = given.word("normals", normals, ("facet", "averaged"))

@@ -151,7 +151,7 @@ class RigidSurface(given.Sealed):
         self.stride = given.number(f"{name}: stride", stride, given.POSITIVE_OR_INFINITE)
         for what, f in (("distance", distance), ("gradient", gradient), ("hessian", hessian)):
             optional = f is None and what == "hessian"
-            given.kind(f"{name}: {what}", f, optional or callable(f), "a function of places (3, n)")
+            given.kind(f"{name}: {what}", f, optional or given.function(f), "a function of places (3, n)")
         # functions of points (n, gdim) from here on
         points = OfPoints(distance)
         self.distance, self.gradient = points.of(distance), points.of(gradient)

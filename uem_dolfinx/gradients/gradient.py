@@ -146,7 +146,7 @@ def taylor_test(
         InputError: if ``size`` is not positive, if J or the slope is not finite, or if the remainder is zero at some h.
         UserFunctionError: if the functional raises an error.
     """
-    given.kind("functional", functional, callable(functional), "a function of h that returns a number")
+    given.kind("functional", functional, given.function(functional), "a function of h that returns a number")
     slope, size = (
         given.number("slope", slope, given.Range("a number", lambda x: True)),
         given.number("size", size, given.POSITIVE),

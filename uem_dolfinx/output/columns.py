@@ -43,7 +43,7 @@ class Columns:
             for name, quantity in (quantities or {}).items():
                 given.name("the name of a column", name)
                 given.kind(
-                    f"columns[{name!r}]", quantity, callable(quantity), "a function without arguments that returns numbers"
+                    f"columns[{name!r}]", quantity, given.function(quantity), "a function without arguments that returns numbers"
                 )
                 if name in self._asked:
                     raise InputError(f"columns[{name!r}]: a reaction has this name: choose another")

@@ -96,8 +96,7 @@ def as_law(friction: Any) -> FrictionLaw:
 def given_friction(friction: Any) -> Field | FrictionLaw:
     """Checked user input for friction: a number, a function or a law."""
     law = as_law(friction)
-    if not callable(law.field):
-        given.number("friction", law.field, given.NOT_NEGATIVE)
+    given_field("friction", law.field, given.NOT_NEGATIVE)
     return law if hasattr(friction, "limit") else law.field
 
 

@@ -84,7 +84,11 @@ class SoftContact(given.Sealed):
         function = p if given.function(p) else None
         if slope is not None:
             given.kind(
-                "slope", slope, callable(slope) and function is not None, "a function of gaps, for a function p", "leave it out"
+                "slope",
+                slope,
+                given.function(slope) and function is not None,
+                "a function of gaps, for a function p",
+                "leave it out",
             )
         if hasattr(p, "pressure"):
             self.law: PressureLaw = given.kind("p", p, True, "a law")

@@ -28,7 +28,7 @@ class OfTemperature(given.Sealed):
     """
 
     def __init__(self, f: Callable[[Array, float, Array], npt.ArrayLike], *, field: int):
-        self.f = given.kind("f", f, callable(f), "a function of places, load factor and temperatures, f(x, t, T)")
+        self.f = given.kind("f", f, given.function(f), "a function of places, load factor and temperatures, f(x, t, T)")
         self.field = given.part_number("field", field, "the temperature")
 
     def __call__(self, x: Array, t: float, T: Array) -> Any:

@@ -75,7 +75,9 @@ class Step:
         take("n", given.count(f"{of}n", self.n))
         take("ramp", given.flag(f"{of}ramp", self.ramp))
         take("loads", check_load(self.loads))
-        given.kind(f"{of}begin", self.begin, self.begin is None or callable(self.begin), "a function without arguments, or None")
+        given.kind(
+            f"{of}begin", self.begin, self.begin is None or given.function(self.begin), "a function without arguments, or None"
+        )
         of_contacts("contacts", "True and False", Contact | GeneralContact, lambda on: given.flag(f"{of}on or off", on))
         of_contacts("friction", "coefficients or laws", Contact, given_friction)
         of_contacts("offset", "lengths or functions", Contact, lambda offset: given_field(f"{of}offset", offset))
