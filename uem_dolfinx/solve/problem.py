@@ -161,9 +161,7 @@ class UnitedProblem(given.Sealed):
             )  # fmt: skip
             self.rtol, self.max_iterations = loop.rtol, loop.max_iterations
             self.line_search, self.verbose = loop.line_search, loop.verbose
-            given.kind(
-                "method", given.function(method) or method, given.function(method), "what makes a united system, as BodySystem"
-            )
+            given.kind("method", given.function(method) or method, given.function(method), "what makes a system, as BodySystem")
             if method is not BodySystem and any(contact.heats or contact.normal for contact in contacts):
                 raise InputError("heat and soft contact need the default method: leave method out, or heat and normal")
         given.alike(
