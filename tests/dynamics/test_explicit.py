@@ -22,6 +22,7 @@ from uem_dolfinx.dynamics.explicit.part_solver import PartSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.bodies import Bodies
+from uem_dolfinx.solve.united import system
 
 COMM = MPI.COMM_WORLD
 #: Without the checks of every state, which assemble residuals.
@@ -331,6 +332,18 @@ def test_a_step_that_fails():
             pass
     assert np.array_equal(bar.u.x.array, bar.problem.committed) and not bar.dynamics.moving
     assert 0.0 < bar.dynamics.time < 1.05 / 80.0
+
+
+@pytest.mark.slow
+def test_every_step_ends_with_a_check_of_signs(monkeypatch):
+    """The check sees the forces that the step has, the wall's in the end."""
+    bar, seen, check = Flight(2, 10, 10.0, 0.5), [], system.check_signs
+    monkeypatch.setattr(
+        system, "check_signs", lambda pairs, least: (seen.append([p.trial.lam.sum() for p in pairs]), check(pairs, least))
+    )
+    _, force, _, _ = bar.run(0.15)
+    pushed = COMM.allreduce(np.array([sum(own) for own in seen[-len(force) :]]))
+    assert pushed == pytest.approx(force, rel=1e-9) and force[-1] > 0.0
 
 
 def test_the_critical_step_is_found_where_cells_change(monkeypatch):
