@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import ufl
 from dolfinx import fem
 from helpers import at, blocks, box, clamp, highest, linear, modulus, refused, run, scene, slow, st_venant
 
@@ -74,6 +75,30 @@ def test_loads_and_motions_are_conjugate(cell, degree):
             assert np.allclose(np.append(led.displacement, led.rotation)[list(held)], step.factor * found[list(held)], rtol=1e-12)
         assert np.abs(b.u.x.array - u).max(initial=0.0) <= 1e-10 * np.abs(found).max()
         assert np.allclose(np.append(*led.reaction) + rest, np.append(force, moment), rtol=1e-9)
+
+
+def test_a_motion_by_expressions():
+    """Of Constants and of the place, which is the point: ramped, but for a Constant of the load; gradients by it are refused."""
+    b = Bar()
+    mesh = b.u.function_space.mesh
+    c, d, X = fem.Constant(mesh, 0.1), fem.Constant(mesh, (0.01, 0.02)), ufl.SpatialCoordinate(mesh)
+    motion, there = (c * X[0] - d[1], X[1] * d[0] ** 2, ufl.sin(c)), lambda c: np.array([2.7 * c - 0.02, 0.4e-4, np.sin(c)])
+    led = uem.RigidCoupling(b.right, b.point, motion=motion)
+    problem = b.problem(led)
+    for step in uem.load_steps(problem, 2):
+        assert np.append(led.displacement, led.rotation) == pytest.approx(step.factor * there(0.1), rel=1e-12)
+    refused(uem.InputError, "expression", lambda: uem.gradient(problem, ufl.inner(b.u, b.u) * ufl.dx, c))
+    b.u.x.array[:] = 0.0
+    led = uem.RigidCoupling(b.right, b.point, motion=motion)
+    problem = b.problem(led, load={c: 0.2})
+    for step in uem.load_steps(problem, 2):
+        assert led.displacement[0] == pytest.approx(there(0.2 * step.factor)[0], rel=1e-12)
+    for wrong in (2.0 * d, b.u[0]):
+        refused(
+            uem.InputTypeError,
+            "expression of Constants",
+            lambda: uem.RigidCoupling(b.right, b.point, motion=(wrong, None, None)),
+        )
 
 
 def test_conditions_among_rigid_nodes():

@@ -259,7 +259,6 @@ def test_expressions_in_place_of_numbers(make):
     if make == "product":
         scalars += [
             lambda: uem.Equation([((x, y), (0, 1))], b=one),
-            lambda: uem.RigidCoupling(b.top, (x, y), motion=(one, None, None)),
             lambda: uem.RigidCoupling(b.top, (x, y), moment=one),
             lambda: uem.SoftContact(one),
         ]

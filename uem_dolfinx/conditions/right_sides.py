@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
+from ufl.core.expr import Expr
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.conditions.equation import LinearEquations, values_of
@@ -58,7 +60,7 @@ class RightSides:
 
 
 def is_ramped(b: Any, loaded: Collection[fem.Constant]) -> bool:
-    """Whether a right-hand side is ramped with the Dirichlet values; functions and ``loaded`` Constants are not."""
-    if isinstance(b, fem.Constant):
-        return not any(b is constant for constant in loaded)
+    """Whether a right-hand side is ramped with the Dirichlet values; functions and what contains ``loaded`` Constants are not."""
+    if isinstance(b, Expr):
+        return not any(one is constant for one in traverse_unique_terminals(b) for constant in loaded)
     return not callable(b)

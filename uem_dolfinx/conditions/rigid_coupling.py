@@ -7,7 +7,12 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 from dolfinx import fem
+from ufl.constantvalue import ConstantValue
+from ufl.core.expr import Expr
+from ufl.core.multiindex import MultiIndex
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import given
 from uem_dolfinx.algebra.rings import DEPENDENT
@@ -39,7 +44,8 @@ class RigidCoupling(given.Sealed):
         moment: about the point, a number in 2D, a vector ``(3,)`` in 3D; numbers, a ``fem.Constant`` or a function, as ``force``.
         motion: displacement of the point and its rotation, each a number, a ``fem.Constant``, a function of the load factor or time, or
             None if free: ``(u_x, u_y, angle)`` in 2D, ``(u_x, u_y, u_z, r_x, r_y, r_z)`` in 3D, with r the rotation vector in radians.
-            Numbers are ramped with the Dirichlet values. None leaves all components free.
+            Numbers are ramped with the Dirichlet values. None leaves all components free. A value may also be a UFL expression of
+            Constants and of the place, which is the point.
         mass: of a rigid body that is fixed to the part and has its centre at the point, in addition to the mass of the meshed part.
             It counts in dynamics, with gravity, and in ``modes``; statics ignores it.
         inertia: of that body about the point: a number in 2D, a number for all axes or a symmetric matrix ``(3, 3)`` in 3D, in the
@@ -85,7 +91,7 @@ class RigidCoupling(given.Sealed):
             raise InputError(given.sentence("motion", motion, f"{n} items, {words}"))
         self._told = {"motion": motion if any(one is not None for one in motion) else None, "inertia": inertia}
         #: Values of the prescribed components by their number.
-        self.prescribed = {i: checked_value(f"motion[{i}]", v, 1) for i, v in enumerate(motion) if v is not None}
+        self.prescribed = {i: _checked_motion(f"motion[{i}]", v) for i, v in enumerate(motion) if v is not None}
         #: Force, moment and prescribed motion as declared, by name.
         self._declared: dict[str, Any] = loads | {f"motion[{i}]": v for i, v in self.prescribed.items()}
         if self.distribute and self.prescribed:
@@ -153,7 +159,7 @@ class RigidCoupling(given.Sealed):
         """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
         comm = self.nodes.config.comm
         for name, value in self._declared.items():
-            if callable(value) and not isinstance(value, fem.Constant):
+            if given.function(value):
                 words = f"the {name} of the RigidCoupling of '{self.name}' at {at:.6g}"
                 self.evaluated[name] = ask_together(comm, words, value, at)
 
@@ -163,12 +169,14 @@ class RigidCoupling(given.Sealed):
 
     def given_values(self) -> dict[str, Any]:
         """Its present values by name; functions are replaced by their last values."""
-        now = {f"the {name}": value for name, value in (self._declared | self.evaluated).items()}
+        values = self._declared | self.evaluated
+        now = {f"the {name}": _number(value, self.point) for name, value in values.items()}
         return {"the point": self.point, "the mass": self.mass, "the inertia": self.inertia, **now}
 
     def _values(self, name: str, size: int) -> Array:
         """Present numbers ``(size,)`` of the force, the moment or a component of the motion."""
-        return values_of(f"{name} of the RigidCoupling of '{self.name}'", self.evaluated.get(name, self._declared[name]), size)
+        value = _number(self.evaluated.get(name, self._declared[name]), self.point)
+        return values_of(f"{name} of the RigidCoupling of '{self.name}'", value, size)
 
     def loads(self) -> tuple[Array, Array]:
         """Present force ``(gdim,)`` and moment ``(n_turns,)`` at the point (collective)."""
@@ -249,6 +257,24 @@ class RigidCoupling(given.Sealed):
         held = np.isin(np.arange(len(sums)), list(self.prescribed))
         sums = np.where(held, sums - np.concatenate(of_joints), 0.0)
         self.reactions = sums[: self._sizes[0]], sums[self._sizes[0] :]
+
+
+def _checked_motion(name: str, value: Any) -> Any:
+    """A component of a motion, unchanged; an expression contains Constants and the place alone."""
+    if not isinstance(value, Expr) or isinstance(value, fem.Constant):
+        return checked_value(name, value, 1)
+    parts = (one for one in traverse_unique_terminals(value) if not isinstance(one, (ConstantValue, MultiIndex)))
+    if value.ufl_shape or any(not isinstance(one, (fem.Constant, ufl.SpatialCoordinate)) for one in parts):
+        raise InputTypeError(given.sentence(name, value, "a scalar expression of Constants and of the place alone"))
+    return value
+
+
+def _number(value: Any, point: Array) -> Any:
+    """The value of an expression at a point, and other values as they are."""
+    if not isinstance(value, Expr) or isinstance(value, fem.Constant):
+        return value
+    constants = (one for one in traverse_unique_terminals(value) if isinstance(one, fem.Constant))
+    return float(value(tuple(point), {one: one.value.item() if one.value.ndim == 0 else one.value for one in constants}))
 
 
 def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:

@@ -27,7 +27,7 @@ from uem_dolfinx.gradients.assemblies import constants_of
 from uem_dolfinx.gradients.contact_fields import check_field, fields_of
 from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
 from uem_dolfinx.gradients.places import Places
-from uem_dolfinx.gradients.refused import refuse_assembly, refuse_parameter, refuse_shape, refuse_soft
+from uem_dolfinx.gradients.refused import motions_of, refuse_assembly, refuse_parameter, refuse_shape, refuse_soft
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.loading import holds, rules_of, set_by
@@ -322,10 +322,11 @@ def refuse_idle_controls(
         held = any(m is one for form in forms for one in (*form.constants(), *form.coefficients()))
         held = held or holds(beside, m) or bool(set_by([m], bcs, n).any())
         with agreed(problem.comm):
-            if holds([rule.value for rule in rules_of(bcs)], m):
+            moved = [value for value in motions_of(problem) if value is not m]
+            if holds([*(rule.value for rule in rules_of(bcs)), *moved], m):
                 raise InputError(
-                    f"{what}[{i}], {given.described(m)}, is in a Dirichlet value by a function or an expression, which has no derivative "
-                    "here: expected it as the value itself, uem.dirichlet(V, tag, component, m)"
+                    f"{what}[{i}], {given.described(m)}, is in a Dirichlet value or a motion by a function or an expression, which has no "
+                    "derivative here: expected it as the value itself, uem.dirichlet(V, tag, component, m)"
                 )
             if not reduced(problem.comm, held, op=MPI.LOR):
                 raise InputError(

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from dolfinx import fem
+from ufl.core.expr import Expr
+
 from uem_dolfinx.conditions.equation import Equation, Periodic
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.preload import Preload
@@ -35,11 +40,18 @@ def refuse_assembly(problem: UnitedProblem, recorded: bool) -> None:
                 f"gradients do not support the RigidCoupling of '{coupling.name}', with distribute=True and large rotations, whose nodal "
                 "forces turn with the part: expected rotations='small', or distribute=False"
             )
+    if recorded and any(isinstance(v, Expr) and not isinstance(v, fem.Constant) for v in motions_of(problem)):
+        raise InputError("histories do not support a motion of a coupling by an expression: expected a Constant, or a number")
     if problem.dynamics is not None and problem.couplings:
         raise InputError(
             "gradients do not support couplings in time, whose parts have velocities and masses of their own: expected statics, or a "
             "stiff part in place of the coupling"
         )
+
+
+def motions_of(problem: UnitedProblem) -> list[Any]:
+    """Values of prescribed motions of couplings as declared."""
+    return [value for one in problem.couplings for value in getattr(one, "prescribed", {}).values()]
 
 
 def refuse_soft(contact: Contact) -> None:
