@@ -79,7 +79,8 @@ def modulus_of(mesh, tags):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("coupling, friction", [("node_to_surface", 0.0), ("mortar", 0.0), ("mortar", 0.3)])
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_five_meshes_of_a_disc(coupling, friction):
     """The same for Hertz with quadratic curved cells, against a mesh of twice as many, from one cell at the contact on."""
     fine = hertz(96, coupling, friction)

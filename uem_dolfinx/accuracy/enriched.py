@@ -41,6 +41,7 @@ class Enriched:
         nodes: its nodes.
         forces: residual of the bodies without contacts, at the owned nodes of W, zero at prescribed components ``(n, gdim)``.
         residual: the same with the contact tractions.
+        traction: of contacts, in the displacement's space; None without contact surfaces.
         energy: ``u' K u`` of the displacement.
     """
 
@@ -63,7 +64,9 @@ class Enriched:
         self._stiffness = stiffness(trial, self.test)
         self.energy = abs(forms.assemble_scalar(stiffness(config.whole, config.whole), config.comm))
         self.forces = self.residual = self.assembled(ufl.replace(F, {test: self.test}))
+        self.traction = None
         if (found := contact_tractions(problem)) is not None:
+            self.traction = found[0]
             self.residual = self.forces - self.assembled(ufl.inner(found[0], self.test) * found[1])
 
     @cached_property

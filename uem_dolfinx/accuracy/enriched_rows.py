@@ -14,14 +14,14 @@ from math import factorial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import basix
 import numpy as np
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import forms
 from uem_dolfinx.accuracy.enriched import Enriched
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.accuracy.enriched_curvature import Side, curvature
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
+from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets, unit
 from uem_dolfinx.geometry.shapes import area_vectors, facet_shape
 from uem_dolfinx.parallel import gathered
 
@@ -43,6 +43,7 @@ class EnrichedRows(NamedTuple):
         active: whether the solution's contactors of the rank's own equations are active ``(m,)``.
         tied: whether their equations always are ``(m,)``.
         own: owned nodes of the enriched space that they belong to ``(m,)``.
+        curvature: global components of rows and columns of the stiffness that contacts add, and values ``(l,)`` each.
         first: first equation of every rank, and one past the last.
     """
 
@@ -55,6 +56,7 @@ class EnrichedRows(NamedTuple):
     active: Bools
     tied: Bools
     own: Ints
+    curvature: tuple[Ints, Ints, Array]
     first: Ints
 
 
@@ -72,14 +74,16 @@ def enriched_rows(enriched: Enriched) -> EnrichedRows:
         states.append((np.repeat(one.active, one.width), np.repeat(one.tied, one.width)))
         at += count
     active, tied = (np.concatenate([np.zeros(0, bool), *part]) for part in (zip(*states) if states else ([], [])))
-    row, node, value, force, gap_row, gap = (np.concatenate(part) for part in zip(*parts))
+    row, node, value, force, gap_row, gap, *curvature = (np.concatenate(part) for part in zip(*parts))
     own = np.concatenate([np.zeros(0, np.int64), *(np.repeat(one.nodes, one.width) for one in surfaces)])
-    return EnrichedRows(row, node, value, force, gap_row, gap, active, tied, own, first)
+    return EnrichedRows(
+        row, node, value, force, gap_row, gap, active, tied, own, (curvature[0], curvature[1], curvature[2]), first
+    )
 
 
 def _none(gdim: int) -> list[Any]:
     none, ints = np.zeros((0, gdim)), np.zeros(0, np.int64)
-    return [ints, ints, none, none, ints, np.zeros(0)]
+    return [ints, ints, none, none, ints, np.zeros(0), ints, ints, np.zeros(0)]
 
 
 class _Surface:
@@ -95,8 +99,7 @@ class _Surface:
     def __init__(self, enriched: Enriched, contact: Contact):
         config, self.enriched, self.contact = enriched.problem.config, enriched, contact
         self.facets = facets_of(config, contact.contactor, "contactor")
-        of_space: Any = SimpleNamespace(V=enriched.W, mesh=config.mesh, tdim=config.tdim, degree=enriched.degree)
-        self.dofs = nodes_of_facets(of_space, contact.contactor).dofs
+        self.dofs = self._dofs(contact.contactor)
         pair, nodes = contact.pair, enriched.nodes
         friction = pair.friction
         self.width = config.gdim if contact.tied or friction is not None else 1
@@ -120,6 +123,12 @@ class _Surface:
         self.nodes = np.flatnonzero(there)
         self.active: Bools = active[self.nodes]
         self.tied: Bools = tied[self.nodes]
+
+    def _dofs(self, tag: Any) -> Indices:
+        """Local nodes of the enriched space on this rank's facets ``(m, nn)``."""
+        config, of = self.enriched.problem.config, self.enriched
+        space: Any = SimpleNamespace(V=of.W, mesh=config.mesh, tdim=config.tdim, degree=of.degree)
+        return nodes_of_facets(space, tag).dofs
 
     def _of_nodes(self, values: Array) -> Array:
         """Values at the displacement's owned nodes ``(n_owned, k)``, at those of the facets ``(m, nn, k)`` (collective)."""
@@ -168,30 +177,57 @@ class _Surface:
         facet, point = np.divmod(np.arange(len(facets.dofs) * n_q), n_q)
         # those of each test function's node: the normal, or all components of tied ones (points, test, direction, component)
         tied, n = tied[facet], projection.normal
+        rubbing = _in_plane(self.rubbing[facet], n)
         directions, along = (np.zeros((*tied.shape, self.width, gdim)) for _ in range(2))
-        directions[:, :, 0], along[:, :, 0] = n[:, None], (n - self.rubbing[facet])[:, None]
+        directions[:, :, 0], along[:, :, 0] = n[:, None], (n - rubbing)[:, None]
         directions[tied] = along[tied] = np.eye(gdim)[: self.width]
         gaps = np.zeros(directions.shape[:-1])
         if not contact.tied:
             gaps = np.where(tied[:, :, None], (gap[:, None] * n)[:, None, : self.width], 0.0)
             gaps[:, :, 0] = np.where(tied, gaps[:, :, 0], gap[:, None])
-        here = _local(enriched, facets, facet, xi[point])
-        sides = [(1.0, *here)]
-        if target.n_nodes:
-            faceted: Any = target
-            sides.append((-1.0, *_on_target(enriched, faceted.facets, projection)))
+        shape = facet_shape(facets.shape.cell, enriched.degree)
+        here = self._side(facets, self.dofs, facet, shape.functions(xi)[point])
+        there = self._opposite(projection) if target.n_nodes else None
         test = area[:, None] * bernstein(facets.shape.cell, enriched.degree, xi)[point]
         found: list[list[Any]] = [[], [], [], []]
-        for sign, there, values, free in sides:
+        for sign, side in ((1.0, here), (-1.0, there)):
+            if side is None:
+                continue
             # (points, test, direction, node, component)
-            value, force = (sign * np.einsum("pt,ptdg,pn,png->ptdng", test, one, values, free) for one in (directions, along))
-            shape = value.shape[:-1]
-            found[0].append(np.broadcast_to(at[facet][:, :, :, None], shape).ravel())
-            found[1].append(np.broadcast_to(there[:, None, None, :], shape).ravel())
+            value, force = (
+                sign * np.einsum("pt,ptdg,pn,png->ptdng", test, one, side.value, side.free) for one in (directions, along)
+            )
+            found[0].append(np.broadcast_to(at[facet][:, :, :, None], value.shape[:-1]).ravel())
+            found[1].append(np.broadcast_to(side.node[:, None, None, :], value.shape[:-1]).ravel())
             found[2].append(value.reshape(-1, gdim))
             found[3].append(force.reshape(-1, gdim))
         weighted = test[:, :, None] * gaps
-        return [*(np.concatenate(part) for part in found), at[facet].ravel(), weighted.ravel()]
+        turned: Any = _none(gdim)[-3:]
+        if contact.sliding == "finite" and enriched.traction is not None:
+            t = np.einsum("qa,nag->nqg", N, enriched.traction.x.array.reshape(-1, gdim)[facets.dofs]).reshape(-1, gdim)
+            lam = -np.einsum("ng,ng->n", t, n) * np.where(tied, 0.0, test).sum(axis=1)
+            turned = curvature(projection, lam, rubbing, here, there, shape)
+        return [*(np.concatenate(part) for part in found), at[facet].ravel(), weighted.ravel(), *turned]
+
+    def _side(self, facets: TargetFacets, dofs: Indices, which: Ints, values: Array) -> Side:
+        """Functions of the enriched space ``(n, nn)`` on some of this rank's facets ``(n,)``, with nodes ``dofs (m, nn)``."""
+        of = self.enriched
+        corners = facets.shape.functions(facet_shape(facets.shape.cell, of.degree).nodes)
+        x = np.einsum("bn,mng->mbg", corners, facets.x)
+        return Side(of.nodes.to_global(dofs)[which], values, np.where(of.held[dofs][which], 0.0, 1.0), x[which])
+
+    def _opposite(self, projection: Any) -> Side:
+        """Functions at the closest points on facets of any rank (collective)."""
+        target: Any = self.contact.pair.discretisation.target
+        facets, exchange = target.facets, target.facets.owners(projection.facet)
+        facet, xi = exchange.send(projection.facet, projection.xi)
+        values = facet_shape(facets.shape.cell, self.enriched.degree).functions(xi)
+        side = self._side(facets, self._dofs(facets.tag), facet - facets.first[self.enriched.problem.comm.rank], values)
+        found = []
+        for answer in exchange.back(*side):
+            found.append(np.zeros((len(projection.facet), *answer.shape[1:]), answer.dtype))
+            found[-1][exchange.rows] = answer
+        return Side(*found)
 
 
 def bernstein(cell: str, degree: int, xi: Array) -> Array:
@@ -236,30 +272,7 @@ def _projected(contact: Contact, drawn: Array, now: Array) -> Any:
     return target.follow(now, anchor)
 
 
-def _local(enriched: Enriched, facets: TargetFacets, which: Ints, xi: Array) -> tuple[Ints, Any, Any]:
-    """Nodes of the enriched space in the cells of this rank's facets, and their functions at points ``xi (n, fdim)`` of the facets.
-
-    Returns:
-        Global nodes ``(n, nn)``, functions ``(n, nn)``, and 1 for their free components ``(n, nn, gdim)``.
-    """
-    cell = compat.cell_name(enriched.problem.config.mesh)
-    corners, topology = basix.geometry(getattr(basix.CellType, cell)), forms.reference_topology(cell)
-    tdim = enriched.problem.config.tdim
-    vertices = corners[np.array(topology[tdim - 1])[facets.sides[which]]]
-    points = np.einsum("na,nag->ng", facet_shape(facets.shape.cell, 1).functions(xi), vertices)
-    nodes = enriched.cells[facets.cells[which]]
-    if not len(points):
-        return enriched.nodes.to_global(nodes), np.zeros(nodes.shape), np.zeros((*nodes.shape, enriched.g))
-    values = forms.create_lagrange_element(cell, enriched.degree).tabulate(0, np.ascontiguousarray(points))[0, :, :, 0]
-    return enriched.nodes.to_global(nodes), values, 1.0 * ~enriched.held[nodes]
-
-
-def _on_target(enriched: Enriched, facets: TargetFacets, projection: Any) -> tuple[Ints, Array, Array]:
-    """As ``_local``, at the feet of a projection on facets of any rank (collective)."""
-    exchange = facets.owners(projection.facet)
-    asked, xi = exchange.send(projection.facet, projection.xi)
-    answers = exchange.back(*_local(enriched, facets, asked - facets.first[enriched.problem.comm.rank], xi))
-    found = [np.zeros((len(projection.facet), *answer.shape[1:]), answer.dtype) for answer in answers]
-    for into, answer in zip(found, answers):
-        into[exchange.rows] = answer
-    return found[0], found[1], found[2]
+def _in_plane(vectors: Array, normal: Array) -> Array:
+    """Vectors of the same length in the tangent plane ``(n, gdim)``."""
+    along = vectors - np.einsum("ng,ng->n", vectors, normal)[:, None] * normal
+    return unit(along) * np.linalg.norm(vectors, axis=1)[:, None]
