@@ -55,7 +55,7 @@ def test_steps_are_doubled_in_time():
     """Steps become longer only where twice the length is accurate as well: none is refused after the first one."""
     control = StepControl(1.0)
     control.longest = 0.25
-    control.done([None] * 3, longer=False)
+    control.done([None] * 3, longer=1.0)
     assert control.longest == 0.25
     control.done([None] * 3)
     assert control.longest == 0.5

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import functools
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from helpers import refused
 from ramp_scenes import COMM, forming, ramped
 
@@ -65,6 +69,32 @@ def test_steps_are_doubled_in_load(path):
     if path(0.5) > 0.5:
         assert sum(step.cuts for step in steps[2:]) == 0 and len(steps) < 12
     assert error(problem) < error(equal)
+
+
+def turning(tolerance, path, comm=COMM):
+    """A block that yields where its top is pressed by ``path`` times a part of its height: largest plastic strain, and steps."""
+    mesh, tags = uem.read_gmsh(uem.example_mesh("two_blocks"), comm, gdim=2, parameters={"n_lower": 2, "n_upper": 3})
+    V = uem.function_space(mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    flows, depth = uem.VonMises(u, 100.0, 0.3, 1.0, 10.0, kind="plane_strain"), fem.Constant(mesh, np.zeros(2))
+    bcs = [uem.dirichlet(V, tags["lower_bottom"]), uem.dirichlet(V, tags["upper_top"], value=depth)]
+    contact = uem.Contact(tags["upper_bottom"], tags["lower_top"])
+
+    def load(f):
+        depth.value[1] = -0.04 * path(f)
+
+    problem = uem.UnitedProblem(flows.residual(v), u, bcs=bcs, contacts=[contact], materials=[flows], load=load)
+    steps = list(uem.load_steps(problem, 1, tolerance=tolerance))
+    return comm.allreduce(flows.peeq.x.array.max(initial=0.0), op=MPI.MAX), steps
+
+
+def test_a_load_that_turns():
+    """To and fro within a part of a step, with zeros at its ends and middle: the halves alone would not see it."""
+    exact, _ = turning(None, lambda f: f)
+    found, steps = turning(3e-3, lambda f: np.interp(f, [0.0, 0.13, 0.26, 1.0], [0.0, 1.0, 0.0, 0.0]))
+    assert abs(found / exact - 1) < 0.1 and sum(step.cuts for step in steps) > 0
+    straight, steps = turning(3e-3, lambda f: f)
+    assert abs(straight / exact - 1) < 3e-3 and len(steps) == 1
 
 
 def test_without_history():

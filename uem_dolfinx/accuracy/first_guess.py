@@ -13,6 +13,7 @@ from uem_dolfinx.geometry.bodies import bodies_in_order
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rank_boxes import RankBoxes
 from uem_dolfinx.parallel import Exchange, agreed, reduced
+from uem_dolfinx.solve.checks import depends_on_path
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Cells around a point, by their centres, of which the one is taken that the point is in or next to.
@@ -25,15 +26,8 @@ INVERTED_IN = 5
 
 def refuse_first_guess(problem: UnitedProblem) -> None:
     """Refuse problems whose solution depends on the path to it."""
-    for present, what in (
-        (bool(problem.materials), "a law with history"),
-        (any(pair.friction is not None for pair in problem.pairs), "friction"),
-        (any(contact.cohesion is not None for contact in problem.contacts), "cohesion"),
-    ):
-        if present:
-            raise InputError(
-                f"solve_again: the problem has {what}, so that its solution depends on the path: leave solve_again out"
-            )
+    if what := depends_on_path(problem):
+        raise InputError(f"solve_again: the problem has {what}, so that its solution depends on the path: leave solve_again out")
 
 
 def carry_over(before: UnitedProblem, after: UnitedProblem) -> None:

@@ -167,6 +167,18 @@ def refuse_other_fields(config: Configuration, what: str, remedy: str) -> None:
         )
 
 
+def depends_on_path(problem: Any) -> str:
+    """What makes a solution depend on the path to it; empty if nothing does."""
+    for present, what in (
+        (bool(problem.materials), "a law with history"),
+        (any(pair.friction is not None for pair in problem.pairs), "friction"),
+        (any(contact.cohesion is not None for contact in problem.contacts), "cohesion"),
+    ):
+        if present:
+            return what
+    return ""
+
+
 def check_hold(problem: Any) -> None:
     """Raise an InputError unless the conditions of a problem can be replaced between time steps."""
     if problem.dynamics is None:

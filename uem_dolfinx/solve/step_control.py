@@ -67,19 +67,19 @@ class StepControl:
         """Length of the next step, if nothing else limits it."""
         return min(self.longest, self.nominal)
 
-    def shorten(self, length: float, error: errors.UEMError) -> bool:
-        """Halve a step of this length that failed.
+    def shorten(self, length: float, error: errors.UEMError, part: float = 0.5) -> bool:
+        """Shorten a step of this length that failed to a part of it.
 
         Returns:
             Whether to try again: not if the error does not depend on the length, or if the step would become too short.
         """
         mendable = isinstance(error, MENDABLE)
-        if not mendable or 0.5 * length < SHORTEST_LENGTH * self.nominal:
+        if not mendable or part * length < SHORTEST_LENGTH * self.nominal:
             if mendable:
                 error.amend(f"shorter steps, down to {length:.3g}, are no better")
             self.give_up()
             return False
-        self.longest, self._cuts = 0.5 * length, self._cuts + 1
+        self.longest, self._cuts = part * length, self._cuts + 1
         logger.info("step %d failed (%s); cut to %.3g", self.number + 1, error, self.longest)
         return True
 
@@ -115,16 +115,16 @@ class StepControl:
         """After a final failure, reset the length to its value before the failed step."""
         self.longest = self._longest_before
 
-    def done(self, iterations: Sequence[object], longer: bool = True, loops: int = 1) -> tuple[int, int]:
+    def done(self, iterations: Sequence[object], longer: float = 2.0, loops: int = 1) -> tuple[int, int]:
         """Count a step that converged with this history; returns its number and the number of its cuts.
 
         Args:
             iterations: the history.
-            longer: whether the next step may be longer if this one was easy.
+            longer: by how much the next step may be longer if this one was easy, at least 1.
             loops: number of Newton loops in the history.
         """
-        if len(iterations) - 1 <= EASY * loops and longer:
-            self.longest *= 2.0
+        if len(iterations) - 1 <= EASY * loops:
+            self.longest *= longer
         self._longest_before = self.longest
         cuts, self._cuts, self.number = self._cuts, 0, self.number + 1
         return self.number, cuts

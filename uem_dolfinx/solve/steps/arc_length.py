@@ -197,7 +197,7 @@ class AlongArc:
         if by is not None:
             refuse_other_laws(problem.contacts, problem.materials)
         self._problem, self._arc, self._by = problem, ArcLength(problem), by
-        self.tried, self.most, self.longer, self.loops = 0.0, MOST_STEPS, True, 1
+        self.tried, self.most, self.longer, self.shorter, self.loops = 0.0, MOST_STEPS, 2.0, 0.5, 1
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
         """Take a step from the committed load factor ``done`` and commit it (collective).

@@ -9,14 +9,19 @@ import numpy as np
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import StepAccuracyError
 from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.checks import depends_on_path
+from uem_dolfinx.solve.loading import values_at
 from uem_dolfinx.solve.memory import Memory
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.by_load import ByLoad
 from uem_dolfinx.solve.united.newton import Iteration
 
-#: The error of a load step over its length grows so much if the length doubles.
-#: [derived; error over length; test_accuracy_of_load_steps.py::test_steps_are_doubled_in_load]
+#: The error of a load step grows so much if its length doubles.
+#: [derived; error; test_accuracy_of_load_steps.py::test_steps_are_doubled_in_load]
 SECOND_ORDER = 4.0
+#: Loads are compared with a straight way between so many points of each half of a step: a load that turns between two of these is not seen.
+#: [bound; points; test_accuracy_of_load_steps.py::test_a_load_that_turns]
+LOOKS = 4
 
 
 @dataclass(frozen=True)
@@ -38,22 +43,41 @@ class Reached:
         u = problem.config.of(np.array(problem.u.x.array))[: problem.config.n_owned]
         return cls(u, np.array(problem.bodies.forces))
 
+    @classmethod
+    def loaded(cls, problem: UnitedProblem, factor: float) -> Reached:
+        """Dirichlet values, and forces at the committed displacement, under the load of a factor (collective)."""
+        problem.set_load(factor)
+        there, n, bodies = cls.of(problem), problem.config.n_owned, problem.bodies
+        values = problem.config.of(np.where(bodies.held, values_at(problem.committed, bodies.bcs), problem.committed))[:n]
+        return cls(values, there.forces)
+
     def apart(self, other: Reached, stiffness: Array) -> Array:
         """Works, in the present stiffness, of the difference in displacements and in forces ``(2,)``."""
-        weight = np.abs(stiffness)
-        compliance = np.divide(1.0, weight, out=np.zeros_like(weight), where=weight > 0.0)
-        return np.array([(weight * (self.u - other.u) ** 2).sum(), (compliance * (self.forces - other.forces) ** 2).sum()])
+        weights = _weights(stiffness)
+        return np.array([(weights[0] * (self.u - other.u) ** 2).sum(), (weights[1] * (self.forces - other.forces) ** 2).sum()])
+
+    def away(self, other: Reached, stiffness: Array) -> Array:
+        """The difference as a vector, of which the square is the sum of these works ``(2, n_owned, gdim)``."""
+        return np.asarray(np.sqrt(_weights(stiffness)) * [self.u - other.u, self.forces - other.forces])
+
+
+def _weights(stiffness: Array) -> tuple[Array, Array]:
+    """Stiffness of each component and its inverse, zero where it vanishes."""
+    weight = np.abs(stiffness)
+    return weight, np.divide(1.0, weight, out=np.zeros_like(weight), where=weight > 0.0)
 
 
 class ByError(ByLoad):
     """Advances a problem by steps of given load, each of which two halves confirm.
 
     Backward steps along a path have an error of second order in their length, so that a step and its halves differ by the error of
-    the halves. Where the path does not matter, as without friction and plasticity, they agree.
+    the halves. Where the path does not matter, as without friction and plasticity, they agree. Where it does, loads that are functions
+    must lead straight from the beginning of each half to its end, up to the tolerance: the halves would not see where they turn.
 
     Args:
         problem: the problem.
-        tolerance: bound on the error of a step over its length, relative to the largest change over a length so far.
+        tolerance: bound on the error of a step, relative to the largest change over the whole load at the speeds so far. The error over the
+            length does not vanish with it in steps where contactors begin to slip, or material to yield, so that it has no bound.
     """
 
     def __init__(self, problem: UnitedProblem, tolerance: float):
@@ -62,7 +86,8 @@ class ByError(ByLoad):
 
     def _step(self, done: float, factor: float) -> list[Iteration]:
         """Reach a load factor by two steps, after one has told their error, and commit these (collective)."""
-        problem = self._problem
+        problem, self.shorter = self._problem, 0.5
+        turn = self._largest_turn(done, factor) if callable(problem.load) and depends_on_path(problem) else 0.0
         problem.set_load(done)
         start = Reached.of(problem)
         self._reach(factor, problem.attempt)
@@ -73,14 +98,35 @@ class ByError(ByLoad):
             first = self._reach(0.5 * (done + factor), problem.attempt)
             problem.keep()
             second = self._reach(factor, problem.attempt)
-            self._refuse_error(start, at_once, Reached.of(problem), factor - done)
+            self._refuse_error(start, at_once, Reached.of(problem), factor - done, turn)
         except BaseException:
             before.put_back(problem)
             raise
         problem.commit()
         return [*first, *second[1:]]
 
-    def _refuse_error(self, start: Reached, at_once: Reached, halves: Reached, length: float) -> None:
+    def _largest_turn(self, done: float, factor: float) -> float:
+        """How far the load of either half is from its straight way, or goes back on it, the root of a work (collective)."""
+        problem = self._problem
+        stiffness = problem.bodies.stiffness
+        if stiffness is None:
+            problem.bodies.update_tangent()
+            stiffness = problem.bodies.stiffness
+        assert stiffness is not None
+        found = 0.0
+        for ends in ((done, 0.5 * (done + factor)), (0.5 * (done + factor), factor)):
+            first, *others = [Reached.loaded(problem, float(at)) for at in np.linspace(*ends, LOOKS + 1)]
+            away = np.array([one.away(first, stiffness).ravel() for one in others])
+            dots = reduced(problem.comm, away @ away.T)
+            way = dots[-1, -1]
+            along = dots[-1] / way if way else np.zeros(LOOKS)
+            nearest = np.clip(along, 0.0, 1.0)
+            apart = np.diag(dots) - 2.0 * nearest * dots[-1] + nearest**2 * way
+            back = np.maximum.accumulate(along) - along
+            found = max(found, float(np.abs(apart).max()), float(back.max()) ** 2 * float(way))
+        return float(np.sqrt(found))
+
+    def _refuse_error(self, start: Reached, at_once: Reached, halves: Reached, length: float, turn: float) -> None:
         """Refuse halves that differ too much from a step at once; find whether the next step may be longer (collective).
 
         Raises:
@@ -90,11 +136,15 @@ class ByError(ByLoad):
         stiffness = problem.bodies.stiffness
         assert stiffness is not None
         errors, changes = reduced(problem.comm, np.array([halves.apart(one, stiffness) for one in (at_once, start)]))
-        control.largest_speed = max(control.largest_speed, float(np.sqrt(changes.sum())) / length)
-        found = float(np.sqrt(errors.sum())) / control.largest_speed if control.largest_speed else 0.0
+        control.largest_speed = max(control.largest_speed, max(float(np.sqrt(changes.sum())), turn) / length)
+        turns = turn > (error := float(np.sqrt(errors.sum())))
+        found = max(error, turn) / control.largest_speed if control.largest_speed else 0.0
+        # a step that is less than twice as long as it may be is cut by the root of half alone, which halves its error
+        self.shorter = 0.5 if found > np.sqrt(SECOND_ORDER) * self._tolerance else np.sqrt(0.5)
         if found > self._tolerance:
+            other, remedy = ("its straight load", ": choose steps that end where the load turns") if turns else ("its halves", "")
             raise StepAccuracyError(
-                f"a load step of {length:.3g} and its halves differ by {found:.3g} of the largest change so far, above the tolerance "
-                f"{self._tolerance:g}"
+                f"a load step of {length:.3g} and {other} differ by {found:.3g} of the largest change so far, above the tolerance "
+                f"{self._tolerance:g}{remedy}"
             )
-        self.longer = SECOND_ORDER * found <= self._tolerance
+        self.longer = 2.0 if SECOND_ORDER * found <= self._tolerance else 1.0

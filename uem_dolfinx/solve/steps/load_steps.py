@@ -150,7 +150,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         try:
             factor, iterations = way.advance(done)
         except UEMError as error:
-            if progress.control.shorten(way.tried, error):
+            if progress.control.shorten(way.tried, error, way.shorter):
                 continue
             from uem_dolfinx.solve.memory import take_back
             from uem_dolfinx.solve.steps.limit_points import LimitPoint

@@ -146,7 +146,7 @@ def _time_steps(
             forces = _contact_forces(problem)
             length, iterations = _step(problem, length, before, tolerance)
             _refuse_given_energy(problem, dynamics, length, forces)
-            longer = accuracy is None or _accurate(problem, dynamics, length, accuracy)
+            longer = 2.0 if accuracy is None or _accurate(problem, dynamics, length, accuracy) else 1.0
         except UEMError as error:
             dynamics.restore()
             problem.set_load(dynamics.time)
