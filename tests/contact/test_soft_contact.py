@@ -46,6 +46,17 @@ def settled(b) -> float:
     return uem.integrate(b.u[b.gdim - 1] * uem.ds(b.top)) / area
 
 
+def test_prescribed_contactors_press():
+    """A surface that is prescribed to be inside a plane has the force of the law there."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [2.0, 1.0], [3, 2])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, bottom = fem.Function(V), s.tag("bottom", 0, at(1, 0.0))
+    bcs = clamp(V, bottom, value=(0.0, -0.01)) + clamp(V, s.tag("top", 0, at(1, 1.0)))
+    contact = uem.Contact(bottom, uem.RigidPlane((0, 0), (0, 1)), normal=uem.SoftContact(3.0))
+    uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact]).solve()
+    assert contact.resultant().force == pytest.approx([0.0, 3.0 * 0.01 * 2.0], rel=1e-12, abs=1e-14)
+
+
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("cell", ["quadrilateral", *map(slow, ["triangle", "hexahedron", "tetrahedron"])])

@@ -120,10 +120,11 @@ def test_contactors_that_are_left_inside(depth, free, left_out, refused, size):
     contact = uem.Contact(b.high, b.low)
     pair = uem.UnitedProblem(linear(b.u, 1.0), b.u, contacts=[contact]).contacts[0].pair
     n = len(pair.nodes)
+    at = SimpleNamespace(movable=np.full(n, free), projection=SimpleNamespace(gap=np.full(n, -depth * pair.config.size)))
+    trial = SimpleNamespace(active=np.ones(n, bool), redundant=np.full(n, left_out), law_gap=None)
     seen = SimpleNamespace(
-        name_at=lambda i: pair.name, config=pair.config, nodes=pair.nodes, off=np.zeros(n, bool), movable=np.full(n, free),
-        trial=SimpleNamespace(active=np.ones(n, bool), redundant=np.full(n, left_out)),
-        projection=SimpleNamespace(gap=np.full(n, -depth * pair.config.size)), tie=None, kinematics=pair.kinematics,
+        members=[pair], discretisation=pair.discretisation, config=pair.config, nodes=pair.nodes, off=np.zeros(n, bool), trial=trial,
+        tie=None, kinematics=at,
     )  # fmt: skip
     if refused:
         raised(uem.OverdeterminedError if free else uem.ConflictError, "inside the target", lambda: checks.check_prescribed(seen))
@@ -142,9 +143,8 @@ def test_contactors_that_pull(pull, refused, size):
 
     def seen(active=True, tied=False, law=False):
         trial = SimpleNamespace(active=np.full(n, active), lam=lam, has_law=law)
-        return SimpleNamespace(
-            name_at=lambda i: pair.name, config=pair.config, nodes=pair.nodes, tied=np.full(n, tied), trial=trial
-        )
+        of = {"members": [pair], "discretisation": pair.discretisation, "config": pair.config, "nodes": pair.nodes}
+        return SimpleNamespace(**of, tied=np.full(n, tied), trial=trial)
 
     for other in (seen(active=False), seen(tied=True), seen(law=True)):
         checks.check_signs([other], [np.zeros(n)])

@@ -88,7 +88,9 @@ def check_prescribed(pair: Interface) -> None:
     """
     left_out = pair.trial.active & pair.trial.redundant
     depth = -pair.kinematics.projection.gap / pair.config.size
-    inside = ~pair.off & ((~pair.kinematics.movable & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
+    # prescribed contactors of soft contact press as others do
+    fixed = ~pair.kinematics.movable & (pair.trial.law_gap is None)
+    inside = ~pair.off & ((fixed & (depth > TOUCHING)) | (left_out & (depth > LEFT_OUT)))
     error = None
     if inside.any():
         i = int(np.argmin(np.where(inside, pair.kinematics.projection.gap, np.inf)))
