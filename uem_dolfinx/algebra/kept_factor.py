@@ -2,7 +2,10 @@
 
 While contactors slide, P and the curvature of the contact change little and near the contact only, and so does the tangent of bodies
 whose strains hardly change. A Krylov method preconditioned by the old factorisation takes a few solves; a new factorisation takes as long
-as about ten. The constrained matrix is not assembled.
+as about ten. The constrained matrix is not assembled. ``Q'KP`` with Q different from P has the factorisation of another such matrix.
+
+The determinants of both matrices have the same sign if none of the real eigenvalues of ``Q'KP`` times the old inverse is negative. The
+Krylov method approximates those that are far from one; a factorisation that leaves a negative one does not serve.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ LEAST_ACCURATE = 1e-3
 
 
 class KeptFactor:
-    """The last factorisation of ``P'KP``, with data of its matrix.
+    """The last factorisation of ``Q'KP``, with data of its matrix.
 
     Args:
         space: the space that K acts on.
@@ -44,39 +47,40 @@ class KeptFactor:
     def __init__(self, space: Nodes):
         self.space = space
         self._pc: Any = None
-        #: Mask of the used columns of P, and the diagonal of K.
+        #: Mask of the used columns of P, the diagonal of K, and whether Q is P.
         self._made_with: Any = None
 
-    def keep(self, pc: PETSc.PC, P: Restriction, K: PETSc.Mat) -> None:
+    def keep(self, pc: PETSc.PC, P: Restriction, K: PETSc.Mat, Q: Restriction) -> None:
         """Keep a new factorisation; not in mixed problems, where one tolerance does not fit residuals with different units."""
         if self.space.mixed:
             return
-        self._pc, self._made_with = pc, (P.used, K.getDiagonal())
+        self._pc, self._made_with = pc, (P.used, K.getDiagonal(), Q is P)
 
     def drop(self) -> None:
         """Drop the factorisation, so that the next matrix is factorised."""
         self._pc = self._made_with = None
 
-    def serves(self, P: Restriction, K: PETSc.Mat) -> bool:
+    def serves(self, P: Restriction, K: PETSc.Mat, Q: Restriction) -> bool:
         """Whether K is nearly unchanged, and all but a few of the used unknowns are the same (collective)."""
         changed: float = np.inf
         if self._made_with is not None:
-            used, diagonal = self._made_with
+            used, diagonal, alike = self._made_with
             there = diagonal.array_r
-            if (np.abs(K.getDiagonal().array_r - there) <= ALIKE * np.abs(there)).all():
+            if alike == (Q is P) and (np.abs(K.getDiagonal().array_r - there) <= ALIKE * np.abs(there)).all():
                 changed = float(np.count_nonzero(used != P.used))
         return bool(reduced(self.space.comm, changed) <= FEW_CHANGES)
 
     def solve(
-        self, P: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, rhs: PETSc.Vec, accuracy: float
+        self, P: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, Q: Restriction, rhs: PETSc.Vec, accuracy: float
     ) -> tuple[PETSc.Vec, int] | None:
         """Unknowns with a relative residual of at most ``accuracy``, and the number of solves; None after too many (collective)."""
         if self._pc is None:
             return None
         ksp = PETSc.KSP().create(self.space.comm)
-        A = PETSc.Mat().createPython(K.getSizes(), _United(P, K, curvature), comm=self.space.comm)
+        A = PETSc.Mat().createPython(K.getSizes(), _United(P, K, curvature, Q), comm=self.space.comm)
         ksp.setOperators(A)
         ksp.setType("fgmres")
+        ksp.setComputeEigenvalues(Q is not P)
         ksp.setGMRESRestart(MOST_SOLVES)
         ksp.setTolerances(rtol=min(accuracy, LEAST_ACCURATE), max_it=MOST_SOLVES)
         pc = ksp.getPC()
@@ -87,6 +91,8 @@ class KeptFactor:
         with timed("linear solve"):
             ksp.solve(rhs, dq)
         found = (dq, int(ksp.getIterationNumber())) if ksp.getConvergedReason() > 0 else None
+        if found is not None and Q is not P and (ksp.computeEigenvalues().real < 0.0).any():
+            found = None
         # otherwise P would be kept alive
         ksp.reset()
         ksp.destroy()
@@ -95,15 +101,15 @@ class KeptFactor:
 
 
 class _United:
-    """``P'(K + G)P`` as a map, for unknowns that are zero at idle columns of P."""
+    """``Q'(K + G)P`` as a map, for unknowns that are zero at idle columns of P."""
 
-    def __init__(self, P: Restriction, K: PETSc.Mat, G: PETSc.Mat | None):
-        self.P, self.K, self.G = P, K, G
+    def __init__(self, P: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, Q: Restriction):
+        self.P, self.K, self.G, self.Q = P, K, G, Q
 
     def mult(self, _: PETSc.Mat, q: PETSc.Vec, y: PETSc.Vec) -> None:
-        """``y = P'(K + G)P q``."""
+        """``y = Q'(K + G)P q``."""
         du = self.P.expand(q)
-        self.P.transpose(forms.product(self.K, du, self.G)).copy(y)
+        self.Q.transpose(forms.product(self.K, du, self.G)).copy(y)
 
 
 class _Solves:

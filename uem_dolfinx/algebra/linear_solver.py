@@ -57,7 +57,7 @@ class UnitedSolver:
         self._crossed: tuple[PETSc.Mat, PETSc.Mat] | None = None
         #: The last factorisation, and the constrained matrix that is solved with it, or None.
         self._kept = KeptFactor(space)
-        self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None] | None = None
+        self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
         #: K condensed onto the contact, and whether the present constrained matrix uses it.
         self.condensed, self._on_condensed = Condensed(space), False
         #: Whether K is the same for every displacement, and K of the last constrained matrix with the state of its values.
@@ -67,8 +67,8 @@ class UnitedSolver:
         self._made_of: Any = None
         #: Arguments of the present constrained matrix.
         self._arguments: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
-        #: P and K of the present constrained matrix, if it is symmetric and factorised.
-        self._factor_of: tuple[Restriction, PETSc.Mat] | None = None
+        #: P, K and Q of the present constrained matrix, if it is factorised and the factorisation may serve others.
+        self._factor_of: tuple[Restriction, PETSc.Mat, Restriction] | None = None
         #: Whether Q is not P, and whether a step begins.
         self._petrov_galerkin = self._begins = False
 
@@ -220,7 +220,7 @@ class UnitedSolver:
             self.ksp.setPC(in_deflation(self.pc, self.space, self._A, restriction, pressed) if hard else self.pc)
         self.ksp.setOperators(self._A)
         if symmetric and not self.iterative and self.pc.getType() in mumps.FACTORISATIONS:
-            self._factor_of = restriction, K
+            self._factor_of = restriction, K, restriction
 
     @property
     def A(self) -> Any:
@@ -241,8 +241,8 @@ class UnitedSolver:
         pays = pays and (self.lasting or again)
         serves = pays and self.condensed.serves(P, Q, K, G)
         if not serves and not (self.lasting and pays and self._factorise_inside(P, Q, K, G)):
-            if not self._petrov_galerkin and self._kept.serves(P, K):
-                self._served = P, K, G
+            if self._kept.serves(P, K, Q):
+                self._served = P, K, G, Q
                 return False
             if self.lasting or not (pays and self._factorise_inside(P, Q, K, G)):
                 return False
@@ -296,7 +296,7 @@ class UnitedSolver:
         """Set ``Q'(K + curvature)P`` as operator of the KSP (collective)."""
         A = self._unsymmetric.update(P, Q, K, curvature)
         if not self.iterative:
-            self._new, self._A = True, A
+            self._new, self._A, self._factor_of = True, A, (P, K, Q) if mumps.solves(self.pc) else None
             self.pc.setReusePreconditioner(False)
         self.ksp.setOperators(A, self._A)
 
