@@ -188,12 +188,12 @@ class Exchange:
     """
 
     def __init__(self, comm: MPI.Comm, rows: Sequence[Ints]):
-        self.comm, self.rows = comm, np.concatenate(rows)
-        self._sent = np.array([len(r) for r in rows], dtype=np.int32)
-        self._received = self._sent.copy()
+        self.comm, self.rows = comm, rows[0] if comm.size == 1 else np.concatenate(rows)
+        self._sent = self._received = np.array([len(r) for r in rows], dtype=np.int32)
         if comm.size > 1:
+            self._received = np.empty_like(self._sent)
             comm.Alltoall(self._sent, self._received)
-        in_order = comm.size == 1 and np.array_equal(self.rows, np.arange(len(self.rows)))
+        in_order = comm.size == 1 and bool((self.rows == np.arange(len(self.rows))).all())
         self._picked: Any = slice(len(self.rows)) if in_order else self.rows
 
     @classmethod
@@ -205,7 +205,7 @@ class Exchange:
             rank: receiving rank of each row ``(n,)``, -1 for no rank.
         """
         if comm.size == 1:
-            return cls(comm, [np.flatnonzero(rank >= 0)])
+            return cls(comm, [(rank >= 0).nonzero()[0]])
         order = np.argsort(rank, kind="stable")
         ends = np.searchsorted(rank[order], np.arange(comm.size + 1))
         return cls(comm, [order[a:b] for a, b in pairwise(ends)])

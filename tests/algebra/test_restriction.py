@@ -19,10 +19,13 @@ from helpers import blocks, clamp, gathered_matrix, gathered_vector, linear, sca
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
+from uem_dolfinx import arrays
+from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import sums_of_rows
+from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 
@@ -316,3 +319,21 @@ def test_rings_that_fade(comm, part, length):
     config = Configuration(blocks(comm, "triangle", 2, 2, gap=0.5).u)
     r = united(config, [(0, [0.0, 1.0], 3), (3, [0.0, 1.0], 0)], coefficient=part)
     assert (r.chain, r.fades, r.rings is None) == (length or 1, bool(length), bool(length))
+
+
+def test_faster_functions_of_arrays():
+    """They are those of NumPy and of dataclasses; a copy forgets what was derived from the fields that change."""
+    rng = np.random.default_rng(0)
+    values, known = rng.integers(0, 20, 50), np.unique(rng.integers(0, 20, 9))
+    assert np.array_equal(arrays.among(values, known), np.isin(values, known)) and not arrays.among(values, known[:0]).any()
+    parts, order = rng.random((50, 2, 3)), rng.permutation(50)
+    for o in (None, order):
+        groups = arrays.sums_of_groups(parts, np.array([0, 7, 8, 40]), o)
+        assert np.abs(groups - np.add.reduceat(parts if o is None else parts[o], [0, 7, 8, 40])).max() < 1e-14
+    rows = UnitingEquations.along(
+        np.array([0, 1], np.int32), np.eye(2), np.full((2, 1), -1), np.zeros((2, 1)), np.ones(2), np.ones(2, bool)
+    )
+    whole = ContactRows.straight(rows, np.arange(2), np.zeros(2, np.int64))
+    assert whole.Q is rows and arrays.replace(whole, tilt=rows).Q.direction[0, 0] == 2.0
+    with pytest.raises(AssertionError, match="nothing"):
+        arrays.replace(whole, nothing=0)

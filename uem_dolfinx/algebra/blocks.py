@@ -67,7 +67,8 @@ def product(A: Blocks, B: Blocks) -> Blocks:
 def in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array, Ints, Ints]:
     """Blocks in the order of their rows, their columns, and the start of each row."""
     order = np.argsort(row, kind="stable")
-    return value[order], column[order], np.append(0, np.cumsum(np.bincount(row, minlength=n_rows)))
+    ends = np.bincount(row, minlength=n_rows).cumsum()
+    return value[order], column[order], np.concatenate([[0], ends])
 
 
 def summed(A: Blocks) -> Blocks:

@@ -74,6 +74,7 @@ class UnitingEquations:
                 np.zeros(0, np.int32), np.zeros((0, block)), np.zeros((0, 0), np.int64), np.zeros((0, 0)), np.zeros(0),
                 np.zeros(0, bool),
             )  # fmt: skip
+        parts = [p for p in parts if p.node.size] or parts[:1]
         if len(parts) == 1:
             return parts[0]
         every = [(p.node, p.direction, p.gap, p.active, p.row, p.followed, p.coefficients) for p in parts]

@@ -20,7 +20,7 @@ from petsc4py import PETSc
 from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, places_of, product, summed, to_owners, together
 from uem_dolfinx.algebra.entries import Entries, blocks_of
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, among
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange, gathered, reduced
@@ -142,19 +142,19 @@ class UnitedMatrix:
         eliminated = np.zeros(last - first, dtype=bool)
         eliminated[own - first] = True
         # K and G have blocks on both sides: a node with a column in an eliminated node's row has that node in a row of its own
-        rows = together(self._inside(own - first), self._outside(np.isin(self._beyond.row, own)))
+        rows = together(self._inside(own - first), self._outside(among(self._beyond.row, own)))
         coupled = rows if G is None else together(rows, G.some(eliminated[G.row - first]))
         trial = self._handed_on(trial, coupled)
         seen = np.unique(trial.row)
         inside = (rows.column >= first) & (rows.column < last)
         near = self._inside(np.setdiff1d(rows.column[inside], own) - first, eliminated)
-        others = self._outside(np.isin(self._beyond.column, seen) & ~eliminated[self._beyond.row - first])
+        others = self._outside(among(self._beyond.column, seen) & ~eliminated[self._beyond.row - first])
         left = together(rows, near, others, *([] if G is None else [G]))
-        on = np.isin(left.column, seen)
+        on = among(left.column, seen)
         X = together(left.some(~on), product(left.some(on), trial))
         at = eliminated[X.row - first]
         changes = summed(together(X.some(~at), to_owners(space, product(test.transposed, X.some(at)))))
-        return changes, ~(eliminated[changes.row - first] | np.isin(changes.column, seen))
+        return changes, ~(eliminated[changes.row - first] | among(changes.column, seen))
 
     def _handed_on(self, trial: Blocks, coupled: Blocks) -> Blocks:
         """Rows of P at eliminated nodes of this rank, and at eliminated nodes of other ranks ``coupled`` with owned nodes (collective)."""

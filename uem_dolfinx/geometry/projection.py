@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
 
 #: A way from the foot that is shorter, in lengths of the facet, or leans from its normal by less, is rounding.
 #: [bound; cosine, and length of the facet; test_offset_edges.py::test_points_on_their_feet]

@@ -6,14 +6,13 @@ rank holds a whole surface; derived quantities are computed on the rank of the p
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, replace
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection

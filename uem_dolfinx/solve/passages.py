@@ -13,6 +13,7 @@ rotates, rolls or bends does not approach itself, and the surface around a facet
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from mpi4py import MPI
@@ -64,7 +65,9 @@ def refuse_passages(
         TunnellingError: names the deepest such contactor of the first rank that has one.
     """
     du = config.displacement - config.of(start)
-    looked_at = [(pair, motion) for pair, motion in zip(pairs, motions) if pair.discretisation.traits.sliding == "finite"]
+    # nothing that could pass is on an empty list
+    may = [pair.discretisation.traits.sliding == "finite" and (pair.asked or not _listed(pair.target)) for pair in pairs]
+    looked_at = list(compress(zip(pairs, motions), may))
     ways = [_ways(pair, du, motion) for pair, motion in looked_at]
     # for each contact: the longest displacements of both sides, the sum of the target's displacements and their number
     mine = np.array(

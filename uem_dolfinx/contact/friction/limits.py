@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,11 @@ class Limits:
         """Set other values of the parameter ``(n,)``; returns the same as ``set``."""
         self.value = value
         return self.law.limit(value, np.zeros(len(value)), self.area)[1]
+
+    @property
+    def given(self) -> tuple[Any, ...]:
+        """What ``cone`` depends on in addition to its arguments; arrays are replaced, never changed."""
+        return self.law, self.value, self.area, self.speed, self._held
 
     def grow(self, kinematics: Kinematics) -> None:
         """Update the areas to the current placement (collective)."""

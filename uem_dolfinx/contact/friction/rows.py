@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
@@ -10,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products, replace
 from uem_dolfinx.contact.friction.frame import Frame
 from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows, without_terms
 from uem_dolfinx.contact.seam.relative_motion import Ties

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from operator import is_not
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
 from uem_dolfinx.contact.friction import rubbing, stick_slip
 from uem_dolfinx.contact.friction.anchors import anchored, anchors_of, way_since
 from uem_dolfinx.contact.friction.frame import Frame
@@ -79,6 +79,8 @@ class Sliding:
         self._directed: tuple[Frame, Array, Array] | None = None
         self._last: LastStep | None = None
         self.pivot = Pivot.begin(np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
+        #: The last state and what its limits depend on, and these limits.
+        self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 6, (np.zeros(n), np.zeros(n))
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set the law and the values of its parameter ``(n,)``."""
@@ -167,7 +169,9 @@ class Sliding:
         return self.limits.hold(lam)
 
     def _cone(self, state: PairState) -> tuple[Array, Array]:
-        return self.limits.cone(state.lam, self.slipping(state))
+        if any(map(is_not, of := (state, *self.limits.given), self._cones[0])):
+            self._cones = of, self.limits.cone(state.lam, self.slipping(state))
+        return self._cones[1]
 
     def _limit(self, state: PairState, lam: Array) -> Array:
         rest, slope = self._cone(state)

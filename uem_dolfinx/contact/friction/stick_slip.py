@@ -14,11 +14,11 @@ doi:10.1016/0045-7825(91)90022-X; Hüeber, Stadler and Wohlmuth, 2008, doi:10.11
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products, replace
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.state import FrictionState
 
@@ -128,7 +128,7 @@ def _left_by(normals: Array, free: Bools) -> Array:
 
 def along(directions: Array, vectors: Array) -> Array:
     """Parts of ``vectors (n, gdim)`` in the span of orthonormal ``directions (n, k, gdim)``: ``(n, gdim)``."""
-    return np.asarray(np.einsum("nrg,nr->ng", directions, np.einsum("nrg,ng->nr", directions, vectors)))
+    return np.asarray(((directions * vectors[:, None]).sum(axis=2, keepdims=True) * directions).sum(axis=1))
 
 
 def find_violations(

@@ -5,13 +5,12 @@ States are arguments and results; nothing is stored.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, replace
 from uem_dolfinx.contact.nodes.corners import find_corners
 from uem_dolfinx.contact.seam.base import OnTarget
 from uem_dolfinx.contact.seam.corners import Corners

@@ -128,6 +128,8 @@ class NodeToSurface(OnTarget):
         if f is None or not isinstance(self.target, MeshTarget) or not isinstance(nearest, FacetProjection):
             return nearest
         i = np.flatnonzero(f.stick & state.active & ~state.in_corner & (f.facet >= 0))
+        if not reduced(self.config.comm, len(i)):
+            return nearest
         own = self.raised(self.target.at(points[i], f.facet[i], f.xi[i]), i)
         return nearest.with_those(i, replace(own, beyond=np.zeros_like(own.beyond)))
 

@@ -6,14 +6,13 @@ The trial state changes in every iteration, the committed state only after conve
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
 from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics, Traction
@@ -121,7 +120,9 @@ class Interface:
 
     def set_active(self, state: PairState) -> None:
         """Set the trial state, with another active set."""
-        self.trial = state if self.friction is None else self.friction.come_and_go(state, self.trial.active)
+        if self.friction is not None and state.active is not self.trial.active:
+            state = self.friction.come_and_go(state, self.trial.active)
+        self.trial = state
 
     def activate_touching(self) -> None:
         """Activate contactors that initially touch without force; with friction they stick (collective)."""

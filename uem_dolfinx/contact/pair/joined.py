@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -57,7 +56,8 @@ class JoinedInterface(Interface):
     def state_of(self, k: int, state: PairState) -> PairState:
         """A contact's part of a state, with its own numbers of facets."""
         target, surface = self.discretisation.target, self.discretisation.surface_of[k]
-        return _renumbered(_rows(state, self.discretisation.rows_of[k]), lambda facet: target.alone(facet, surface))
+        own = self.discretisation.rows_of[k]
+        return _each(lambda name, a: target.alone(a[own], surface) if name in FACETS else a[own], state)
 
     def with_state_of(self, k: int, state: PairState, part: PairState) -> PairState:
         """The state with a contact's part."""
@@ -83,16 +83,16 @@ class JoinedInterface(Interface):
 
 def _each(change: Callable[..., Any], *states: PairState) -> PairState:
     """The state whose arrays are made by ``change(name, *arrays)``, of arrays that all ``states`` have."""
-    first = states[0]
+    parts: list[Any] = [vars(state) for state in states]
     found = {
-        f.name: change(f.name, *(getattr(s, f.name) for s in states))
-        for f in fields(PairState)
-        if f.name != "friction" and getattr(first, f.name) is not None
+        name: change(name, *[part[name] for part in parts])
+        for name, value in parts[0].items()
+        if name != "friction" and value is not None
     }
-    if first.friction is not None:
-        of = [s.friction for s in states]
+    if states[0].friction is not None:
+        parts = [vars(state.friction) for state in states]
         found["friction"] = FrictionState(
-            **{f.name: change(OF_FRICTION + f.name, *(getattr(o, f.name) for o in of)) for f in fields(FrictionState)}
+            **{name: change(OF_FRICTION + name, *[part[name] for part in parts]) for name in parts[0]}
         )
     return PairState(**found)
 

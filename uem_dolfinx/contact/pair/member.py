@@ -32,6 +32,8 @@ class Member(Interface):
         self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
         self.name, self.max_penetration, self.tie, self.heats = own.name, own.max_penetration, None, []
         self._known: tuple[Kinematics, PairState, Kinematics] | None = None
+        #: The last trial state of all contacts that was looked at, and its part.
+        self._seen: tuple[PairState, PairState] | None = None
 
     @property
     def whole(self) -> Interface:
@@ -43,7 +45,9 @@ class Member(Interface):
     @property
     def trial(self) -> PairState:  # type: ignore[override]
         """State of the present iteration."""
-        return self.joined.state_of(self._k, self.joined.trial)
+        if self._seen is None or self._seen[0] is not self.joined.trial:
+            self._seen = self.joined.trial, self.joined.state_of(self._k, self.joined.trial)
+        return self._seen[1]
 
     @trial.setter
     def trial(self, state: PairState) -> None:

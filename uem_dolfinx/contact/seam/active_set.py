@@ -9,11 +9,11 @@ over them between ``find_violations`` and ``exchange``.
 from __future__ import annotations
 
 from collections.abc import Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array, Bools, replace
 from uem_dolfinx.contact.seam.state import PairState
 
 #: Contactors whose gap is smaller, as part of the model's size, touch without force.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import Array, Bools, replace
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.projection import Projection
 from uem_dolfinx.geometry.search import ON_SIDE
@@ -83,6 +83,8 @@ class Ends:
 
 def slide_off(state: PairState, off: Bools) -> PairState:
     """The state after release of active contactors that are ``off (n,)`` the target."""
+    if not (state.active & (off | state.passed)).any():
+        return state
     gone = state.active & off
     active = state.active & ~off
     return replace(state, active=active, at_end=state.at_end | gone, passed=(state.passed | gone) & ~active)

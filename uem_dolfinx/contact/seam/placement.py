@@ -8,14 +8,14 @@ and forces only, not on rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.configuration import Configuration
@@ -121,9 +121,9 @@ class ContactRows:
         return replace(
             r,
             direction=r.direction + t.direction,
-            row=np.append(r.row, t.row),
-            followed=np.append(r.followed, t.followed),
-            coefficients=np.append(r.coefficients, t.coefficients, axis=0),
+            row=np.concatenate([r.row, t.row]),
+            followed=np.concatenate([r.followed, t.followed]),
+            coefficients=np.concatenate([r.coefficients, t.coefficients]),
         )
 
     @property

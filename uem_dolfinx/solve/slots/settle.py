@@ -7,7 +7,7 @@ rows, its increment and the check of all conditions follow as for any other stat
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from uem_dolfinx.algebra.options import FACTORISED_UP_TO
 from uem_dolfinx.algebra.relative import Condensation, RelativeCoordinates
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DependentRingError
-from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints, replace
 from uem_dolfinx.contact.laws.law import slides_otherwise
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam import active_set

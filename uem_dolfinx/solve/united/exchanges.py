@@ -339,8 +339,8 @@ class Exchanges:
 
 def _pattern(t: PairState) -> Ints:
     """Integers that identify the state of each contactor: active, corner, stick and direction of slip ``(n, k)``."""
-    found, f = np.column_stack([t.active, t.held]).astype(np.int64), t.friction
-    return found if f is None else np.column_stack([found, f.stick, np.rint(f.direction).astype(np.int64)])
+    along = [] if t.friction is None else [t.friction.stick[:, None], np.rint(t.friction.direction)]
+    return np.concatenate([t.active[:, None], t.held, *along], axis=1, dtype=np.int64, casting="unsafe")
 
 
 def _calm(pair: Interface, which: Bools) -> bool:

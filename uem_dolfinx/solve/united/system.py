@@ -345,7 +345,7 @@ class BodySystem:
 
     def _take(self, forces: list[Traction]) -> None:
         """Store the contact forces in the pairs."""
-        for pair, own in zip(self.pairs, forces):
+        for pair, own in filter(lambda told: told[0].asked, zip(self.pairs, forces)):
             pair.set_forces(own)
         if self.linear is not None:
             self.linear.multipliers = self._multipliers
