@@ -20,8 +20,8 @@ COMM = MPI.COMM_WORLD
 DROP, WAY, ALONG = 0.14, 0.8, 18
 
 
-def drawn(cell, slope, *, sliding="small", steps=1, rigid=False):
-    """Force on a block whose top is led along a surface ``y = 1 + slope(x)`` and down onto it."""
+def pushed(cell, slope, *, sliding="small", rigid=False, **how):
+    """A problem, its contact, and the way of the top of a block that is led along a surface ``y = 1 + slope(x)`` and down onto it."""
     g = 3 if cell in ("tetrahedron", "hexahedron") else 2
 
     def raised(x):
@@ -41,8 +41,13 @@ def drawn(cell, slope, *, sliding="small", steps=1, rigid=False):
     if rigid:
         up = uem.RigidPlane([0.0] * (g - 1) + [1.0], [-slope(1.0), *[0.0] * (g - 2), 1.0])
         bcs += [uem.dirichlet(V, s.tag("all", 0, lambda x: x[:, 0] >= -1.0))]
-    contact = uem.Contact(foot, up, coupling="mortar", sliding=sliding)
-    problem = uem.UnitedProblem(linear(u, 100.0), u, bcs=bcs, contacts=[contact])
+    contact = uem.Contact(foot, up, coupling="mortar", sliding=sliding, **how)
+    return uem.UnitedProblem(linear(u, 100.0), u, bcs=bcs, contacts=[contact]), contact, push
+
+
+def drawn(cell, slope, *, steps=1, **how):
+    """Force on the block at the end of its way."""
+    problem, contact, _ = pushed(cell, slope, **how)
     for _ in uem.load_steps(problem, steps):
         pass
     return np.asarray(contact.resultant().force)
@@ -70,3 +75,23 @@ def test_force_on_an_incline_is_normal_to_it(cell, rigid, sliding):
     if rigid:
         finite = drawn(cell, lambda x: 0.1 * x, sliding="finite", rigid=True)
         np.testing.assert_allclose(force, finite, atol=1e-9 * force[-1])
+
+
+def test_wear_on_a_slope_goes_on_from_a_checkpoint(folder):
+    """Slip is measured by the rows of its own step: a resumed run is the uninterrupted one."""
+
+    def advance(run, steps):
+        for k in steps:
+            run[2].value[:] = (0.1 * WAY * k, -DROP * min(k, 3) / 3)
+            run[0].solve()
+
+    path = folder / "third"
+    whole, resumed = (pushed("quadrilateral", lambda x: 0.1 * np.sin(2 * x), wear=1e-2) for _ in range(2))
+    advance(whole, (1, 2, 3))
+    uem.write_checkpoint(path, whole[0].state())
+    uem.read_checkpoint(path, resumed[0].state())
+    for run in (whole, resumed):
+        advance(run, (4, 5))
+    volumes = [run[1].worn_volume for run in (whole, resumed)]
+    assert volumes[0] > 0.0 and volumes[1] == pytest.approx(volumes[0], rel=1e-12)
+    np.testing.assert_allclose(resumed[0].u.x.array, whole[0].u.x.array, atol=1e-13)

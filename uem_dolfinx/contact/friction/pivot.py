@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.seam.relative_motion import Ties
+    from uem_dolfinx.geometry.configuration import Configuration
     from uem_dolfinx.geometry.rigid import Motion
 
 
@@ -54,3 +58,10 @@ class LastStep:
     ties: Ties
     x: Array
     motion: Motion | None
+
+    def renewed(self, config: Configuration, discretisation: Any) -> bool:
+        """Whether nothing has moved since, so that small sliding may have renewed its rows (collective)."""
+        if discretisation.traits.sliding != "small":
+            return False
+        still = self.motion is discretisation.target.motion and np.array_equal(self.x, config.x[: config.n_owned])
+        return bool(reduced(config.comm, still, op=MPI.LAND))

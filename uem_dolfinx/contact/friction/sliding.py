@@ -97,7 +97,7 @@ class Sliding:
         """Find the anchors, or the relative motions of contactors, in the current configuration (collective)."""
         if self.discretisation.traits.pointwise:
             self._anchors, self._held_by = anchors_of(_of(state), self.discretisation.target, self.config.gdim == 3)
-        elif self._last is None:
+        elif self._last is None or self._last.renewed(self.config, self.discretisation):
             here = self.config.x[: self.config.n_owned].copy()
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion)
         self.limits.grow(kinematics)
