@@ -105,6 +105,32 @@ def test_blocks_adhere_again(coupling):
         assert highest(COMM, np.abs(contact.pressures + 0.5 * way)) < 1e-6 and contact.balance().force < 1e-12
 
 
+@pytest.mark.parametrize("coupling", ["mortar", slow("node_to_surface")])
+def test_snapping_in(coupling):
+    """Blocks that come nearer than the range snap together, and stretch by what is left of the gap: the same iterations in all units."""
+    gap, near, L_of = 0.03, 0.019, (1.0, 1e-9, 1e3)
+    taken = []
+    for L in L_of:
+        b = blocks(COMM, "quadrilateral", 2, 3 if coupling == "mortar" else 4, gap=gap, pose=lambda x, L=L: L * x)
+        # the range is 0.02; attraction falls off with the gap faster than both blocks pull back
+        contact = uem.Contact(b.high, b.low, cohesion=uem.Adhesion(0.001 * L, 0.1), coupling=coupling)
+        down = fem.Function(b.V)
+
+        def move(s, down=down, L=L):
+            down.x.array[1::2] = -(gap - near) * L * s
+
+        bcs = [uem.dirichlet(b.V, b.bottom), uem.dirichlet(b.V, b.top, value=down)]
+        problem = uem.UnitedProblem(
+            linear(b.u, 1.0, 0.0), b.u, bcs=bcs, contacts=[contact], load=move, petsc_options_prefix="adhesion_"
+        )
+        steps = list(uem.load_steps(problem, 1))
+        taken.append([(step.newton_iterations, [i.exchanges for i in step.iterations]) for step in steps])
+        # two blocks in series: strain near / 2, of the modulus 1
+        assert contact.resultant().force[1] == pytest.approx(-0.5 * near * L, rel=1e-6)
+        assert contact.n_active > 0
+    assert taken[0] == taken[1] == taken[2] and taken[0][0][0] <= 4
+
+
 def test_switched_off_and_on():
     """A contact that was switched off attracts again as soon as it is switched on."""
     b = blocks(COMM, "quadrilateral", 2, 3)

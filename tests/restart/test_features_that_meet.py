@@ -135,7 +135,7 @@ def explicit_steps_with_friction(L, S):
 
 
 def adhesion_in_time(L, S):
-    b = Blocks(L, S, gap=0.0, layers=6)
+    b = Blocks(L, S, gap=0.002, layers=6)
     velocity = fem.Function(b.V)
     velocity.x.array.reshape(-1, 2)[b.V.tabulate_dof_coordinates()[:, 1] > 0.001 * L, 1] = -0.02 * np.sqrt(S)
 

@@ -35,8 +35,6 @@ class AdhesiveInterface(SofteningInterface):
         self.trial = self.committed = replace(self.committed, cohesion=np.zeros((n, 2)))
         #: Multipliers of the rows of gaps, negative in attraction, and stiffnesses ``(n,)``.
         self._pull = self._stiffness = np.zeros(n)
-        #: Linearised problems of this step still without softening, this one too, and their number the next time.
-        self._convex, self._next = 0, 1
 
     def activate_touching(self) -> None:
         """See ``Interface``; a contact that was switched off attracts again."""
@@ -52,18 +50,7 @@ class AdhesiveInterface(SofteningInterface):
         share = self.kinematics.pressure_map(False).force
         a, slope = self._law.attraction(self.kinematics.gap_rows.equations.gap[: len(share)] / share)
         area = np.where(self.off | ~self._contact.leads(), 0.0, self._contact.measured_areas())
-        self._exchanged, self._convex = 0, max(self._convex - 1, 0)
-        self._pull, self._stiffness = -area * a / share, area * (0.0 if self._convex else slope) / share**2
-
-    def _make_convex(self) -> None:
-        """Leave softening out of this linearised problem and the next ones of this step, each time of twice as many."""
-        if not self._convex:
-            self._convex, self._next, self._stiffness = self._next, 2 * self._next, 0.0 * self._stiffness
-
-    def restore(self) -> None:
-        """See ``Interface``."""
-        super().restore()
-        self._convex, self._next = 0, 1
+        self._pull, self._stiffness = -area * a / share, area * slope / share**2
 
     def _pulled(self) -> Array:
         """Forces of attraction on the contactors ``(n, gdim)`` (collective)."""
@@ -78,11 +65,11 @@ class AdhesiveInterface(SofteningInterface):
         """The attraction, as loads of both bodies."""
         return self.kinematics.gap_rows.forces(self._all()) if self.trial.cohesion is not None else None
 
-    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+    def slip_terms(self, convex: bool = False) -> tuple[Ints, Array, Array] | None:
         """Terms of friction, and the stiffness of the attraction; see ``Interface``."""
-        own = super().slip_terms()
-        nodes, which, v = stiffness_of_gaps(self, self._stiffness)
-        blocks = self._stiffness[which, None, None] * v[:, :, None] * v[:, None, :]
+        own, stiffness = super().slip_terms(convex), 0.0 * self._stiffness if convex else self._stiffness
+        nodes, which, v = stiffness_of_gaps(self, stiffness)
+        blocks = stiffness[which, None, None] * v[:, :, None] * v[:, None, :]
         pull = nodes, blocks, np.zeros(v.shape)
         return pull if own is None else together(own, pull)
 

@@ -10,9 +10,6 @@ Damage is committed with the step. With friction, limits are those of the damage
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -22,18 +19,10 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.laws.cohesive import Cohesive, Response
 from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.ties.bonds import Bonds
 from uem_dolfinx.parallel import reduced
 
-#: Bonds that have changed between growing, resting and broken damage so often in a step get the stiffness without growth, with which
-#: bodies come down to another equilibrium where the path jumps.
-#: [bound; changes in a step; -]
-MOST_SWINGS = 6
-#: After so many exchanges of contactors in one linearised problem softening is left out of it, which makes the problem convex.
-#: [bound; exchanges; -]
-MOST_EXCHANGED = 4
 #: Columns of the state: damage, delayed damage, the load factor or time that it belongs to, and whether damage has grown in the last step;
 #: the permanent opening and the normal of the next step follow.
 DAMAGE, DELAYED, AT, GREW, PERMANENT = range(5)
@@ -41,31 +30,6 @@ DAMAGE, DELAYED, AT, GREW, PERMANENT = range(5)
 
 class SofteningInterface(Interface):
     """Contactors with forces that soften as gaps open, which can make linearised problems indefinite."""
-
-    #: Exchanges since the last placement.
-    _exchanged = 0
-    #: Whether bodies may come down to another equilibrium, by a stiffness without softening; not along an arc.
-    _may_jump = True
-
-    @contextmanager
-    def along_path(self) -> Iterator[None]:
-        """Keep the whole derivative, with which an arc finds the load, so that bodies do not jump to another equilibrium."""
-        self._may_jump = False
-        try:
-            yield
-        finally:
-            self._may_jump = True
-
-    def exchange(self, violated: Violations) -> None:
-        """See ``Interface``; where exchanges do not end, softening has made the linearised problem indefinite (collective)."""
-        super().exchange(violated)
-        self._exchanged += 1
-        if self._exchanged == MOST_EXCHANGED and self._may_jump:
-            self._make_convex()
-
-    @abstractmethod
-    def _make_convex(self) -> None:
-        """Leave softening out of this linearised problem."""
 
     @property
     def growth(self) -> tuple[bool, bool]:
@@ -99,8 +63,6 @@ class CohesiveInterface(SofteningInterface):
         n, g = len(self.nodes), self.config.gdim
         #: Derivatives of the bonds' forces by their equations, and without growth of damage ``(n, gdim, gdim)``.
         self._tangent = self._secant = np.zeros((n, g, g))
-        #: Branch of the law of each bond at the last placement of this step, and how often it has changed ``(n,)``.
-        self._branch, self._changes = np.zeros(0, np.int64), np.zeros(n, np.int64)
         #: Openings at the first placement of this step ``(n, gdim)``.
         self._first: Array | None = None
         #: Parameter of friction of surfaces without cohesion ``(n,)``.
@@ -141,23 +103,13 @@ class CohesiveInterface(SofteningInterface):
         area = self._bonds.bonded_areas(self._contact._areas)[:, None]
         self._bonds.multipliers = -area * now.traction / share
         self._bonds.holds = (area[:, 0] > 0.0) & (now.delayed < 1.0)
-        self._secant, tangent = ((area / share)[:, :, None] * part / share[:, None, :] for part in (now.secant, now.tangent))
-        self._tangent = np.where(self._swings(now, before)[:, None, None], self._secant, tangent)
-        self._exchanged = 0
+        self._secant, self._tangent = (
+            (area / share)[:, :, None] * part / share[:, None, :] for part in (now.secant, now.tangent)
+        )
         states = np.column_stack(
             [now.damage, now.delayed, np.full(len(area), at), now.damage > before[:, DAMAGE], now.permanent, normal]
         )
         self.trial = replace(self.trial, cohesion=states, bond=self._bonds.multipliers)
-
-    def _swings(self, now: Response, before: Array) -> Bools:
-        """Bonds that have changed between growing, resting and broken damage too often in this step ``(n,)``."""
-        here = np.where(now.damage >= 1.0, 2, np.where(now.damage > before[:, DAMAGE], 1, 0))
-        moved = here != self._branch if len(self._branch) else np.zeros(len(here), bool)
-        self._changes, self._branch = self._changes + moved, here
-        return (self._changes > MOST_SWINGS) & self._may_jump
-
-    def _make_convex(self) -> None:
-        self._tangent = self._secant
 
     @property
     def growth(self) -> tuple[bool, bool]:
@@ -171,12 +123,12 @@ class CohesiveInterface(SofteningInterface):
         areas = self._bonds.bonded_areas(self._contact._areas)
         return float(max(self._law.energy, self._law.shear_energy) * areas.max(initial=0.0))
 
-    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+    def slip_terms(self, convex: bool = False) -> tuple[Ints, Array, Array] | None:
         """Terms of friction, and the stiffness of the bonds; see ``Interface``."""
-        own = super().slip_terms()
+        own = super().slip_terms(convex)
         if self._bonds.rows is None:
             return own
-        nodes, blocks = self._bonds.stiffness(self._tangent)
+        nodes, blocks = self._bonds.stiffness(self._secant if convex else self._tangent)
         bonds = nodes, blocks, np.zeros(blocks.shape[:2])
         return bonds if own is None else together(own, bonds)
 
@@ -218,7 +170,6 @@ class CohesiveInterface(SofteningInterface):
         """See ``Interface``."""
         super().restore()
         self._first = None
-        self._branch, self._changes = np.zeros(0, np.int64), np.zeros(len(self.nodes), np.int64)
 
     def remember(self, state: PairState) -> None:
         """See ``Interface``."""

@@ -274,7 +274,7 @@ class Interface:
         parts = k.curvature(self.trial) if along is None else k.curvature(self.trial, along)
         return parts if self.tie is None else parts + self.tie.curvature(self.trial)
 
-    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+    def slip_terms(self, convex: bool = False) -> tuple[Ints, Array, Array] | None:
         """Terms of sliding friction in tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
         return None if self.friction is None else self.friction.slip_terms(self.trial, self.kinematics)
 

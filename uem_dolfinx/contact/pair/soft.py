@@ -246,7 +246,7 @@ class SoftInterface(Interface):
         nodes, forces = self.kinematics.gap_rows.forces(self._area * by / self._force)
         return -self.config.add_at_owners(nodes, forces)
 
-    def slip_terms(self) -> tuple[Ints, Array, Array] | None:
+    def slip_terms(self, convex: bool = False) -> tuple[Ints, Array, Array] | None:
         """Stiffness of the gaps, and their forces by what is left between the gaps and those of the law; see ``Interface``."""
         if not self._acts:
             return None

@@ -214,7 +214,7 @@ def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:
 
 
 def slip_terms(
-    pairs: Sequence[Interface], du: PETSc.Vec, linear: UserRows | None = None
+    pairs: Sequence[Interface], du: PETSc.Vec, linear: UserRows | None = None, convex: bool = False
 ) -> tuple[PETSc.Mat | None, PETSc.Vec | None]:
     """Tangent terms of slip directions, heat through contacts, masses at points and springs, and residual terms of slip (collective).
 
@@ -222,12 +222,13 @@ def slip_terms(
         pairs: of all contacts.
         du: a vector with the layout of all unknowns.
         linear: equations of users, or None.
+        convex: whether softening is neglected.
 
     Returns:
         Matrix and vector, each None if it vanishes.
     """
     g, comm = du.getBlockSize(), du.comm.tompi4py()
-    parts = [terms for terms in (pair.slip_terms() for pair in pairs) if terms is not None]
+    parts = [terms for terms in (pair.slip_terms(convex) for pair in pairs) if terms is not None]
     heat = [part for pair in pairs for one in pair.heats for part in one.tangent()]
     slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
     passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0

@@ -10,7 +10,6 @@ measured in the displacement only: other fields, with other units, have no part 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 
 from mpi4py import MPI
@@ -219,10 +218,7 @@ class AlongArc:
         else:
             energy = np.inf if self._by is None else self._by.energy * self.tried / progress.control.nominal
             self._arc.begin(done, (1.0 - progress.dissipating) * way / size, progress.reach * self.tried, energy)
-            with ExitStack() as path:
-                for pair in bonds:
-                    path.enter_context(pair.along_path())
-                iterations = self._attempt(bonds)
+            iterations = self._attempt(bonds)
             factor = self._arc.factor
             spent = self._arc.dissipated(self._way(np.array(problem.u.x.array) - before), factor - done)
             dissipating = float(np.clip(spent / energy, 0.0, 1.0))
@@ -249,7 +245,7 @@ class AlongArc:
     def _attempt(self, bonds: Sequence[SofteningInterface]) -> list[Iteration]:
         """Equilibrium along the arc; an error names an energy that is too large (collective)."""
         try:
-            return self._problem.attempt(along=self._arc)
+            return self._on_path(along=self._arc)
         except ConvergenceError as error:
             if self._by is not None:
                 each = max((pair.largest_energy for pair in bonds), default=0.0)
@@ -257,10 +253,17 @@ class AlongArc:
             raise
 
     def _by_load(self, factor: float) -> list[Iteration]:
-        """Equilibrium under a given load."""
+        """Equilibrium under a given load, on the path."""
         self._problem.set_load(factor)
         _check_values(self._problem)
-        return self._problem.attempt()
+        return self._on_path()
+
+    def _on_path(self, along: ArcLength | None = None) -> list[Iteration]:
+        """Equilibrium on the path, which bodies do not leave where it becomes unstable."""
+        system = self._problem.system
+        assert isinstance(system, BodySystem)
+        with system.exchanges.along_path():
+            return self._problem.attempt(along=along)
 
     def _way(self, change: Array) -> Array:
         """Change of the displacement's owned components ``(n_owned * gdim,)``, from a change of all local unknowns ``(n,)``."""

@@ -12,7 +12,8 @@ every linearised problem in which contactors would otherwise change one by one.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -31,7 +32,9 @@ from uem_dolfinx.solve.rigid.first_touch import deepest_of
 from uem_dolfinx.solve.rigid.floating import FAR
 
 if TYPE_CHECKING:
+    from uem_dolfinx.algebra.linear_solver import UnitedSolver
     from uem_dolfinx.contact.friction.pivot import Pivot
+    from uem_dolfinx.solve.united.newton import Increment
 
 #: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
 #: [convention; a direction; test_exchanges.py::test_the_order_does_not_depend_on_ranks]
@@ -89,7 +92,8 @@ class Exchanges:
         pairs: of all contacts.
 
     Attributes:
-        straight: whether the linearised problem neglects the curvature of contact.
+        straight: whether the linearised problem neglects the curvature of contact, and softening where bodies may jump.
+        may_jump: whether bodies may come down to another equilibrium from a path that has become unstable; not along an arc.
         convex: whether terms of the curvature that could make the tangent indefinite are neglected. Beyond a limit point, Newton's
             method does not leave the path by itself; with a convex tangent the bodies reach another equilibrium of lower energy.
         frozen: whether stick and slip states are fixed until the bodies have moved.
@@ -99,7 +103,7 @@ class Exchanges:
 
     def __init__(self, pairs: Sequence[Interface]):
         self._pairs = pairs
-        self._frictional = any(pair.friction is not None for pair in pairs)
+        self._frictional, self.may_jump = any(pair.friction is not None for pair in pairs), True
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -109,6 +113,25 @@ class Exchanges:
         #: Whether the curvature is convex, and the residual norm at which it became so; zero to set it at the next visit.
         self.convex, self._from = False, 0.0
         self.begin()
+
+    @property
+    def softens(self) -> bool:
+        """Whether contacts soften, and bodies need not follow an unstable path: without softening their energy falls in any case."""
+        return self.may_jump and any(pair.trial.cohesion is not None for pair in self._pairs)
+
+    @staticmethod
+    def climbs(solver: UnitedSolver, step: Increment) -> bool:
+        """Whether the matrix of the last solve has negative eigenvalues, as far as its factors or the solution tell (collective)."""
+        return solver.indefinite or solver.negative if solver.exact else solver.space.work(step.dq, step.rhs) < 0.0
+
+    @contextmanager
+    def along_path(self) -> Iterator[None]:
+        """Keep softening in all tangents, with which an arc finds the load."""
+        self.may_jump = False
+        try:
+            yield
+        finally:
+            self.may_jump = True
 
     def begin(self) -> None:
         """Begin another linearised problem."""
@@ -143,7 +166,7 @@ class Exchanges:
         return True
 
     def choose(
-        self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0
+        self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0, climbs: bool = False
     ) -> list[Violations] | None:
         """Contactors that change state now; None if the linearised problem is solved.
 
@@ -152,6 +175,7 @@ class Exchanges:
             gaps: that decide on contact, of every pair ``(n,)``.
             curved: whether the linearised problem includes the curvature of contact.
             way: largest displacement of a node, a length.
+            climbs: whether softening makes the linearised problem indefinite: it is left out, which bounds the energy from above.
 
         Raises:
             ConvergenceError, FrictionError: if no rule is left; names the contactors that cycle.
@@ -159,6 +183,9 @@ class Exchanges:
         comm = self._pairs[0].config.comm
         if self.frozen:
             violated = [w.of_contact() for w in violated]
+        if climbs and not self.straight:
+            self.straight = True
+            return [w.among(np.zeros_like(w.enter)) for w in violated]
         own = (
             sum(w.count for w in violated),
             sum(int(w.enter.sum()) for w in violated),
@@ -184,8 +211,8 @@ class Exchanges:
                 self.straight = self.convex = True
             self._hold_limits()
             return [w.among(np.zeros_like(w.enter)) for w in violated]
-        if rule >= Rule.FIRST and curved and not self.straight:
-            # with curvature the problem may have no solution or several; without curvature it has exactly one
+        if rule >= Rule.FIRST and (curved or self.softens) and not self.straight:
+            # with curvature or softening the problem may have no solution or several; without it has exactly one
             self._pivoting, self.straight, self.convex = Pivoting(), True, True
         elif rule == Rule.WORST:
             worst = reduced(comm, max(w.worst for w in violated), op=MPI.MAX)

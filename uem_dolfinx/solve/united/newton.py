@@ -117,6 +117,7 @@ class LinearisedProblem(NamedTuple):
         passing: whether another iteration follows in any case.
         fits: whether a full step needs no line search.
         convex: whether terms that could make the tangent indefinite are neglected, so that the line search may also lengthen steps.
+        softens: whether forces may grow on the way down, so that the line search takes steps that forces drive on.
     """
 
     state: IterationState
@@ -126,6 +127,7 @@ class LinearisedProblem(NamedTuple):
     passing: bool
     fits: bool
     convex: bool
+    softens: bool = False
 
 
 class Increment(NamedTuple):
@@ -400,8 +402,8 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
             along, least = work_of(dq, residual), first(state.rounding) * first(norms(dq))
             enough = min(bodies.most_past, ENOUGH_DECREASE) if along * work < 0.0 else ENOUGH_DECREASE
             less_work = abs(along) <= max(enough * abs(work), least)
-            downhill = problem.convex and along < 0.0
-            if downhill and not less_work and length == 1.0:
+            downhill = (problem.convex or problem.softens) and along < 0.0
+            if problem.convex and downhill and not less_work and length == 1.0:
                 return _downhill(bodies, method, state, start, step)
             if less_work or downhill or first(norms(residual)) <= enough * driving(bodies, state.test, step.rhs, step.du):
                 return length

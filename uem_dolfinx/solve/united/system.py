@@ -254,7 +254,7 @@ class BodySystem:
         hold = partial(self.floating.hold, self.bodies.free_rows)
         return make_rows(self.over_constraints, self.near, hold, self.bodies.prescribed, self.linear)
 
-    def _trial_of(self, rows: Rows) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
+    def _trial_of(self, rows: Rows, convex: bool = False) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
         """P, terms of the slip directions in tangent and residual, number of active contactors, and their largest gap (collective)."""
         # if equations conflict, P might eliminate other components than Q
         contested = self.over_constraints.shared or rows.conflict
@@ -263,11 +263,10 @@ class BodySystem:
         trial = rows.frictionless
         if apart is not None:
             trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
-        gaps = [pair.largest_gap_here() for pair in self.near]
-        gaps += [] if self.linear is None else [self.linear.largest_gap_here()]
+        gaps = [one.largest_gap_here() for one in (*self.near, self.linear) if one is not None]
         united = sum(int(pair.united.sum()) for pair in self.near)
         told = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
-        return trial, *slip_terms(self.near, self.unknowns.vector(), self.linear), int(told[:, 0].sum()), float(told[:, 1].max())
+        return trial, *slip_terms(self.near, self.unknowns.vector(), self.linear, convex), int(told[:, 0].sum()), told[:, 1].max()
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state with an active set changed where gaps and forces, both to first order, violate contact conditions (collective)."""
@@ -295,8 +294,9 @@ class BodySystem:
             costly = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap)
             if costly and (solved := state.rows.settle(self.bodies, self.residual(), self.curvature, increment)):
                 return self._with_rows(state, solved)
+            climbs = self.exchanges.softens and self.exchanges.climbs(self.solver, step)
             any_left = violated if self._adrift and count(self.pairs, violated) else None
-            chosen = any_left if self._adrift else self.exchanges.choose(violated, gaps, self.curvature is not None, way)
+            chosen = any_left if self._adrift else self.exchanges.choose(violated, gaps, self.curvature is not None, way, climbs)
             if chosen is None and sliding is not None and not self.exchanges.frozen:
                 raise united_rows.not_held()
             if chosen is None or self._adrift:
@@ -313,13 +313,12 @@ class BodySystem:
         """The same bodies and residual with the rows of the pairs' present states, and their solution if known (collective)."""
         rows = self._rows()
         self._adrift = self.floating.adrift  # a released body has to fall first
-        return state.with_rows(rows, solved, *self._trial_of(rows)[:4])
+        return state.with_rows(rows, solved, *self._trial_of(rows, self.exchanges.straight and self.exchanges.softens)[:4])
 
     def _predicted_forces(self, state: BodyState, du: PETSc.Vec, F: PETSc.Vec) -> PETSc.Vec:
         """``F = K du`` plus the terms of contact and friction, and the present forces (collective)."""
-        for more in (self.curvature, state.added):
-            if more is not None:
-                F.axpy(1.0, forms.product(more, du))
+        for more in filter(None, (self.curvature, state.added)):
+            F.axpy(1.0, forms.product(more, du))
         F.axpy(1.0, self.residual())
         if state.held is not None:
             F.axpy(1.0, state.held)
@@ -415,6 +414,7 @@ class BodySystem:
             passing=passing,
             fits=linear or (self.linear is not None and self.linear.joints_led(CLOSED * self.config.size)),
             convex=self.exchanges.convex,
+            softens=self.exchanges.softens,
         )
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
