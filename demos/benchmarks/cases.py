@@ -266,8 +266,9 @@ class BoxScene(Scene):
             end: 0 or 1.
             within: places of the drawing ``(n, gdim)`` that count; None takes all.
         """
-        value = (self.boxes[body].lo, self.boxes[body].hi)[end][axis]
-        on = at(axis, value, 1e-9 * max(1.0, abs(value)))
+        lo, hi = self.boxes[body].lo, self.boxes[body].hi
+        value = (lo, hi)[end][axis]
+        on = at(axis, value, 1e-9 * max(abs(value), hi[axis] - lo[axis]))
         where = on if within is None else lambda x: on(x) & within(x)
         return self.tag(f"body_{body + 1}_{'xyz'[axis]}{end}", body, where, 10 * body + 2 * axis + end + 1)
 

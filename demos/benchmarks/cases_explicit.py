@@ -41,26 +41,27 @@ def only_exact(trial: Trial) -> None:
         raise NotApplicable("explicit steps are for exact contact")
 
 
-def bar(layer: float, speed: float, contactors: str, trial: Trial) -> None:
+def bar(layer: float, speed: float, size: float, contactors: str, trial: Trial) -> None:
     """A bar hits a rigid wall: no energy gained, and an impulse that is right.
 
     Args:
         layer: thickness of the cells at the wall over that of the others.
         speed: over that of the wave.
+        size: length of the bar.
         contactors: with their mass, or without.
         trial: the method.
     """
     only_exact(trial)
-    small, v = speed < 0.1, speed * C
-    gap = 0.3 * v * H / C
+    small, v, h = speed < 0.1, speed * C, size * H
+    gap = 0.3 * v * h / C
 
     def squeezed(x: np.ndarray, k: int) -> np.ndarray:
         """The lowest row of cells as a layer, the others as they are."""
         y = x[:, 1] - gap
-        return np.column_stack([x[:, 0], gap + np.where(y < 0.5 * H, y, np.where(y < 1.5 * H, H * layer + (y - H), y))])
+        return np.column_stack([x[:, 0], gap + np.where(y < 0.5 * h, y, np.where(y < 1.5 * h, h * layer + (y - h), y))])
 
     scene = BoxScene(
-        [Box((0.0, gap), (H, gap + 1.0), (1, N), RHO * C**2)],
+        [Box((0.0, gap), (h, gap + size), (1, N), RHO * C**2)],
         pose=squeezed,
         nu=0.0,
         law=uem.LinearElastic if small else uem.NeoHooke,
@@ -68,12 +69,12 @@ def bar(layer: float, speed: float, contactors: str, trial: Trial) -> None:
     scene.unite(scene.side(0, 1, 0), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
     # a shock leaves vibrations that the longest steps do not resolve
     dynamics = explicit(scene, (0.0, -v), contactors, safety=0.9 if small else 0.3)
-    problem = trial.create(scene.F, scene.u, scene.moduli, H, contacts=scene.contacts, dynamics=dynamics)
+    problem = trial.create(scene.F, scene.u, scene.moduli, h, contacts=scene.contacts, dynamics=dynamics)
     motion, momentum = Motion(problem, scene), -float(dynamics.momentum()[-1])
-    for step in uem.time_steps(problem, end=gap / v + 2.2 / C):
+    for step in uem.time_steps(problem, end=gap / v + 2.2 * size / C):
         trial.iterations += step.newton_iterations
         if step.number % LOOK == 0:
-            trial.check("overlap", overlap(scene, layer * H), OVERLAP)
+            trial.check("overlap", overlap(scene, layer * h), OVERLAP)
             trial.check("energy gained", max(0.0, gained(motion, dynamics, step.dt)), FORCE)
     # as fast as it came; at large strains waves have other speeds, and part of the energy stays in vibrations
     impulse = motion.impulse() / momentum
@@ -129,9 +130,15 @@ def case(name: str, what: str, run: object, quick: bool = True) -> list[Case]:
 
 
 CASES = [
-    *case("bar", "a bar hits a rigid wall", partial(bar, 1.0, 0.1 * V0 / C)),
-    *case("layer 0.01", "cells at the wall are a hundredth of the others", partial(bar, 0.01, 0.1 * V0 / C), quick=False),
-    *case("half the wave speed", "a bar of rubber hits a wall at half the speed of its waves", partial(bar, 1.0, 0.5)),
+    *case("bar", "a bar hits a rigid wall", partial(bar, 1.0, 0.1 * V0 / C, 1.0)),
+    *case("bar of 1 nm", "a bar of a nanometre", partial(bar, 1.0, 0.1 * V0 / C, 1e-9), quick=False),
+    *case("bar of 1 km", "a bar of a kilometre", partial(bar, 1.0, 0.1 * V0 / C, 1e3), quick=False),
+    *case("layer 0.01", "cells at the wall are a hundredth of the others", partial(bar, 0.01, 0.1 * V0 / C, 1.0), quick=False),
+    *case("layer 0.001", "cells at the wall are a thousandth of the others", partial(bar, 0.001, 0.1 * V0 / C, 1.0), quick=False),
+    *case("half the wave speed", "a bar of rubber hits a wall at half the speed of its waves", partial(bar, 1.0, 0.5, 1.0)),
+    *case("the wave speed", "the same at the speed of its waves", partial(bar, 1.0, 1.0, 1.0), quick=False),
+    *case("twice the wave speed", "the same at twice the speed of its waves", partial(bar, 1.0, 2.0, 1.0), quick=False),
     *case("E 1 : 1e4", "a bar hits a stiffer one", partial(two_bars, 1e4, 1.0), quick=False),
+    *case("E 1 : 1e6", "a bar hits one a million times as stiff", partial(two_bars, 1e6, 1.0), quick=False),
     *case("E and mass 1 : 1e6", "a bar hits a stiffer, heavier one", partial(two_bars, 1e6, 1e6)),
 ]

@@ -20,6 +20,8 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.dynamics.explicit.part_solver import PartSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
+from uem_dolfinx.dynamics.explicit.surface import Prediction
+from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.united import system
@@ -298,6 +300,31 @@ def test_calls_of_a_step(monkeypatch):
     assert len(calls) <= 5 * 3000 or COMM.size > 1
 
 
+def test_how_long_a_factor_of_the_surface_serves(monkeypatch):
+    """Four solves bring the surface of a bar of NeoHooke's law into equilibrium, or leave the rest to one iteration of Newton's method."""
+    solves, factors, inside = [0], [0], []
+    predict, prepare, solve = Prediction.predict, Prediction._prepare, SurfaceSolver.solve
+
+    def predicting(self, start):
+        solves.append(0)
+        inside.append(1)
+        predict(self, start)
+        inside.clear()
+
+    def solving(self, *args):
+        solves[-1] += len(inside)
+        return solve(self, *args)
+
+    monkeypatch.setattr(Prediction, "predict", predicting)
+    monkeypatch.setattr(Prediction, "_prepare", lambda self: factors.append(1) or prepare(self))
+    monkeypatch.setattr(SurfaceSolver, "solve", solving)
+    for speed, iterations in ((1.0, 0), (9.0, 1)):
+        bar, solves[:], factors[:] = Flight(2, 12, speed, 0.0, law=uem.NeoHooke, nu=0.3), [0], []
+        bar.problem.rtol = 1e-10
+        taken = [step.newton_iterations for step in uem.time_steps(bar.problem, end=0.3)]
+        assert max(solves) <= 4 and len(factors) == 2 and max(taken[1:]) == iterations and len(taken) > 10
+
+
 @pytest.mark.parametrize("law", [uem.LinearElastic, uem.NeoHooke])
 def test_forces_under_loads_that_change(law):
     """The forces of a step are those of the residual at its displacement and load, also where the load has changed or rests."""
@@ -402,6 +429,28 @@ def test_it_goes_on_from_a_checkpoint(tmp_path, law, stop):
     for one, other in ((again.u, whole.u), (again.dynamics.velocity, whole.dynamics.velocity)):
         change = np.abs(one.x.array - other.x.array).max(initial=0.0)
         assert change == 0.0 or (COMM.size > 1 and change <= 1e-11 * np.abs(other.x.array).max(initial=1.0))
+
+
+def test_steps_shortened_by_a_refusal_stay_short(monkeypatch, tmp_path):
+    """Steps are shorter from a refused one on, also in a run that goes on from a checkpoint after it."""
+    path, step, limit = COMM.bcast(str(tmp_path / "run.h5")), ExplicitStepper.step, []
+
+    def refusing(self, dt):
+        limit[:] = limit or [0.5 * dt]
+        if self.problem.step_control.number == 3 and dt > limit[0]:
+            self.limit = limit[0]
+            raise uem.StepAccuracyError("too long")
+        return step(self, dt)
+
+    monkeypatch.setattr(ExplicitStepper, "step", refusing)
+    whole, first, again = (Flight(2, 6, law=uem.NeoHooke, gap=9.0) for _ in range(3))
+    every = [(step.number, step.dt) for step in uem.time_steps(whole.problem, end=0.4)]
+    assert every[-2][1] == 0.9 * limit[0] and len(every) > 10
+    for taken in uem.time_steps(first.problem, end=0.4, checkpoint=uem.Checkpoint(path, every=5)):
+        if taken.number == 5:
+            break
+    later = [(step.number, step.dt) for step in uem.time_steps(again.problem, end=0.4, checkpoint=uem.Checkpoint(path, every=5))]
+    assert later == every[5:]
 
 
 REFUSED = {

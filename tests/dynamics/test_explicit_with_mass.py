@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from mpi4py import MPI
 
 import numpy as np
@@ -14,6 +16,7 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.dynamics.explicit.mass_solver import MassSolver
+from uem_dolfinx.dynamics.explicit.part_solver import PartSolver
 from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver
 from uem_dolfinx.parallel import reduced
 
@@ -68,6 +71,8 @@ def test_a_bar_on_a_wall(how):
     # half a cell of mass stops at the wall
     lost = 1.0 - energy[-1] / book.rows[0].kinetic
     assert 0.0 <= lost < 1.3 * 0.5 * cell / LENGTH
+    # which is work of contact, but for what central differences keep of the vibration within a step
+    assert max(abs(row.defect) for row in book.rows) < 0.5 * 0.5 * cell / LENGTH * book.rows[0].kinetic
 
 
 def test_what_is_lost_is_of_the_mesh():
@@ -219,6 +224,28 @@ def test_massless_nodes_are_refused():
     problem = uem.UnitedProblem(form, u, dynamics=uem.Dynamics(mass, scheme=uem.CentralDifferences(), contactors="massy"))
     with pytest.raises(uem.MassError, match="have no mass"):
         next(uem.time_steps(problem, end=1.0))
+
+
+@pytest.mark.parametrize(
+    ("how", "factors", "calls"), [({}, 0, 3000), ({"general": True}, 0, np.inf), ({"lower": True}, 1, np.inf)]
+)
+def test_a_step_in_lasting_contact(monkeypatch, how, factors, calls):
+    """On a wall the last equations predict a step: no iteration, no factorisation, 3,000 calls. On a bar one factor serves a step."""
+    problem, _, _ = bars(3, cells=10, gap=0.0, **how)
+    made, called, factorise = [], [], PartSolver._factorise
+    monkeypatch.setattr(PartSolver, "_factorise", lambda self, *a: made.append(1) or factorise(self, *a))
+    steps = uem.time_steps(problem, end=0.5)
+    while next(steps).time < 0.15:
+        pass
+    made.clear()
+    sys.setprofile(lambda frame, event, arg: called.append(1) if event in ("call", "c_call") else None)
+    try:
+        taken = [next(steps).newton_iterations for _ in range(5)]
+    finally:
+        sys.setprofile(None)
+    assert len(made) <= 5 * factors and (max(taken) == 0) == (factors == 0)
+    # ranks exchange in more of them
+    assert len(called) <= 5 * calls or COMM.size > 1
 
 
 @pytest.mark.parametrize("lower", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -361,9 +361,12 @@ class Restriction:
         return self.space.vector(total)
 
     def fingerprint(self, *, values: bool) -> int:
-        """Hash of this rank's part of P: of free components, sparsity and active equations, optionally of values up to rounding."""
+        """Hash of this rank's part of P: free components, columns in use, sparsity, active equations, perhaps values up to rounding."""
         eq = self.equations
-        parts = [*(v.tobytes() for v in (self.free, eq.node, eq.row, eq.followed, eq.active)), str(self.chain).encode()]
+        parts = [
+            *(v.tobytes() for v in (self.free, self.used, eq.node, eq.row, eq.followed, eq.active)),
+            str(self.chain).encode(),
+        ]
         if values:
             # closest points that have moved by rounding do not change P
             parts += [np.rint(v / NEGLIGIBLE).astype(np.int64).tobytes() for v in (eq.direction, eq.coefficients)]

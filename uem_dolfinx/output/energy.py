@@ -12,6 +12,7 @@ import ufl
 
 from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.form_checks import check_functional, check_linear
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -56,7 +57,8 @@ class EnergyBook(Closing, given.Sealed):
     """Energy balance and momenta, one row per time step, optionally as a CSV file.
 
     Columns: the fields of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... on the
-    contactor's body. Works are integrated by the trapezoidal rule.
+    contactor's body. Works are integrated by the trapezoidal rule. In explicit steps with massy contactors, contact acts on masses for
+    the whole step: a row after every step has the exact impulse, and ``contact`` has what plastic impacts of these masses take.
 
     Args:
         problem: with ``dynamics``.
@@ -116,6 +118,9 @@ class EnergyBook(Closing, given.Sealed):
                 "%s ends at time %.6g and is gone on with at %.6g: the work in between is missing; write a row after every step",
                 path, begin["time"], self.dynamics.time,
             )  # fmt: skip
+        #: Whether contact strikes masses at the beginning of explicit steps, and the mean velocity of the last step ``(n,)``.
+        self._struck = is_explicit(self.dynamics) and self.dynamics.contactors == "massy"
+        self._rate = np.array(self.dynamics.mean_velocity.x.array[: problem.config.n_owned * problem.config.gdim])
         # the work of the first step uses the initial load, too
         problem.set_load(self.dynamics.time)
         self._read_forces()
@@ -137,7 +142,7 @@ class EnergyBook(Closing, given.Sealed):
         driving = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
         reaction = (driving - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
-        outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external) + linear
+        outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
         if problem.bodies.tangent.points is not None:
             outer += problem.bodies.tangent.points.loads().ravel()
         if added := self.dynamics.added:
@@ -145,8 +150,8 @@ class EnergyBook(Closing, given.Sealed):
             outer -= self.dynamics.added_forces(carried=True)
         #: Forces from outside on these masses, and their displacements.
         self._at_points = [(one.pushed, one.places) for one in added]
-        #: Forces of damping, from outside, and of contact ``(3, n)``.
-        self._forces = np.stack([self._assembled(self._damping), outer, contact])
+        #: Forces of damping, from outside, of contact, and of equations, from outside as well ``(4, n)``.
+        self._forces = np.stack([self._assembled(self._damping), outer, contact, linear + np.zeros(n)])
         self._resultants = np.array([c.resultant().force for c in self._contacts]).reshape(-1, problem.config.gdim)
 
     def _assembled(self, form: Any) -> Array:
@@ -177,12 +182,16 @@ class EnergyBook(Closing, given.Sealed):
         u, forces, resultants, time, driven = self._u, self._forces, self._resultants, self._time, self._driven
         before = self._at_points
         self._read_forces()
-        works = 0.5 * (forces + self._forces) @ (self._u - u)
-        works[1] += self._driven - driven
-        self._works += reduced(self.problem.comm, works)
+        works, impulse = 0.5 * (forces + self._forces) @ (self._u - u), 0.5 * (resultants + self._resultants)
+        if self._struck and self._time - time <= 1.5 * (dt := self.dynamics.dt):
+            # the forces act between the mean velocities of two steps
+            rate, self._rate = self._rate, (self._u - u) / dt
+            works[2:], impulse = 0.5 * dt * self._forces[2:] @ (rate + self._rate), self._resultants
+        works[1] += self._driven - driven + works[3]
+        self._works += reduced(self.problem.comm, works[:3])
         pairs = zip(before, self._at_points)
         self._works[1] += sum(0.5 * float(((push + pushed) * (place - was)).sum()) for (push, was), (pushed, place) in pairs)
-        self._impulse += 0.5 * (resultants + self._resultants) * (self._time - time)
+        self._impulse += impulse * (self._time - time)
         return self._append(self._energies())
 
     def _append(self, energies: tuple[float, float, float]) -> Energies:

@@ -57,6 +57,11 @@ class StepControl:
             logger.warning("continuing with steps of %.6g; the steps before the checkpoint were %.6g", nominal, self.nominal)
         self.nominal, self._cuts, self._read = nominal, 0, False
 
+    def lower(self, nominal: float) -> float:
+        """Lower the nominal length to this one, if it is less, within a step; returns the nominal length."""
+        self.nominal = min(self.nominal, nominal)
+        return self.nominal
+
     @property
     def cut(self) -> bool:
         """Whether the present step has been cut."""

@@ -34,16 +34,25 @@ class PartSolver(UnitedSolver):
         self.lasting = True
         self._pc: PETSc.PC | None = None
         self._at: Ints = np.zeros(0, np.int64)
+        #: Columns of P in use, and fingerprint of the matrix without coefficients of P.
+        self._used: Bools = np.zeros(0, bool)
+        self._alike: tuple[Any, ...] | None = None
 
     def set_operator(
         self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, roughly: bool = False
     ) -> None:
-        """Set ``Q'(K + G)P``, and factorise its coupled part (collective)."""
+        """Set ``Q'(K + G)P``, and factorise its coupled part; without slip and ``roughly``, not where P's coefficients alone change.
+
+        Collective.
+        """
         P, Q = restriction, test or restriction
-        before, self._made_of = self._made_of, made_of(P, Q, K, G, False)
-        if before is not None and before == self._made_of:
+        made = made_of(P, Q, K, G, False)
+        if made is not None and made == self._made_of:
             return
-        self._used: Bools = P.used.ravel()
+        alike = made_of(P, Q, K, G, True)
+        if roughly and made is not None and alike == self._alike:
+            return
+        self._made_of, self._alike, self._used = made, alike, P.used.ravel()
         with timed("united matrix of explicit steps"):
             self._unite(P, Q, K, G)
 

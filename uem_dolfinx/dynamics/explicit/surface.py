@@ -20,10 +20,10 @@ from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver, numbers
 from uem_dolfinx.log import compiling
 
 #: Solves with the kept matrix in one step, before Newton's method goes on with its own.
-#: [bound; solves; -]
+#: [convention; solves; test_explicit.py::test_how_long_a_factor_of_the_surface_serves]
 MOST_SURFACE_SOLVES = 4
 #: The kept matrix serves as long as Newton's method needs no more iterations after it.
-#: [bound; iterations; -]
+#: [convention; iterations; test_explicit.py::test_how_long_a_factor_of_the_surface_serves]
 ITERATIONS_OF_KEPT = 1
 
 

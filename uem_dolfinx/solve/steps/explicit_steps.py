@@ -58,8 +58,8 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
             problem.restore()
             stepper.forget()
             if isinstance(error, StepAccuracyError):
-                # until the critical step is found anew
-                length = min(length, dynamics.scheme.safety * stepper.limit)
+                # until the critical step is found anew, also from a checkpoint on
+                length = control.lower(dynamics.scheme.safety * stepper.limit)
             if control.shorten(taken, error):
                 continue
             raise

@@ -1,0 +1,100 @@
+"""What an explicit step costs: time over that of the residual, share of contact, calls of Python, and traffic and cells of each rank.
+
+``PYTHONPATH=demos python demos/benchmarks/explicit_cost.py --json FILE`` measures on 1 and 2 ranks, in processes of their own.
+A bar with a square section hits a rigid wall; steps are timed while it stays there, each after an assembly of its residual.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ufl
+from common import comm
+from benchmarks import collectives
+from benchmarks.apart import run_on
+from benchmarks.measure import machine
+from benchmarks.scenes import at, box, scene
+from dolfinx import fem
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat, forms, log
+
+LAWS, CELLS = {"linear": uem.LinearElastic, "NeoHooke": uem.NeoHooke}, ("tetrahedron", "hexahedron")
+#: Stages of a step that contact makes.
+CONTACT = ("search and projection", "uniting equations", "united matrix of explicit steps")
+STEPS, LENGTH, GAP, C = 20, 3, 0.01, 30.0
+
+
+def cost(law: str, cell: str, n: int, contactors: str = "massless") -> dict[str, Any]:
+    """Figures of one scene with n cells across, on the ranks of this call."""
+    s = scene(comm, cell, [box(cell, [0.0, 0.0, GAP], [1.0, 1.0, GAP + LENGTH], [n, n, LENGTH * n])])
+    V = compat.function_space(s.mesh, 1, (3,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    material = LAWS[law](C**2, 0.3, kind="3d")
+    wall = uem.Contact(s.tag("bottom", 0, at(2, GAP)), uem.RigidPlane(np.zeros(3), (0.0, 0.0, 1.0)), name="wall")
+    mass, scheme = uem.lumped_mass(V, 1.0), uem.CentralDifferences()
+    dynamics = uem.Dynamics(mass, velocity=(0.0, 0.0, -1.0), scheme=scheme, contactors=contactors)
+    problem = uem.UnitedProblem(material.residual(u, v) * ufl.dx, u, contacts=[wall], dynamics=dynamics)
+    steps, residual, b = uem.time_steps(problem, end=1.0), forms.form(problem.bodies.F), compat.create_vector(V)
+    while next(steps).time < 2.0 * GAP:
+        pass
+    times, before = [], sum(log.timing(stage)[1] for stage in CONTACT)
+    for _ in range(STEPS):
+        comm.barrier()
+        start = time.perf_counter()
+        forms.assemble_vector(b, residual)
+        between = time.perf_counter()
+        next(steps)
+        times.append((between - start, time.perf_counter() - between))
+    within = sum(log.timing(stage)[1] for stage in CONTACT) - before
+    calls: Counter[str] = Counter()
+    sys.setprofile(lambda frame, event, arg: calls.update([event]) if event in ("call", "c_call") else None)
+    next(steps)
+    sys.setprofile(None)
+    sent: dict[str, int] = {}
+    if collectives.counts():
+        with collectives.traffic() as stages:
+            next(steps)
+        sent = dict(zip(collectives.KINDS, map(int, sum(stages.values(), np.zeros(len(collectives.KINDS), np.int64)))))
+    of_residual, of_step = np.median(comm.allgather(times), axis=1).max(axis=0)
+    return {
+        "law": law, "cell": cell, "contactors": contactors, "ranks": comm.size, "unknowns": 3 * V.dofmap.index_map.size_global,
+        "residual": float(of_residual), "step": float(of_step), "over_residual": float(of_step / of_residual),
+        "contact_share": max(comm.allgather(within / sum(t[1] for t in times))), "calls": sum(calls.values()),
+        "cells": comm.allgather(s.mesh.topology.index_map(3).size_local), "sent": comm.allgather(sent),
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--json")
+    arguments.add_argument("--where", choices=("apart", "here"), default="apart")
+    arguments.add_argument("--ranks", default="1,2", help="numbers of ranks, comma-separated")
+    arguments.add_argument(
+        "--sizes", default="10,22", help="cells across, comma-separated: 10 has 11,000 unknowns, 22 has 106,000"
+    )
+    args = arguments.parse_args()
+    points: list[dict[str, Any]] = []
+    if args.where == "apart":
+        for ranks in map(int, args.ranks.split(",")):
+            points += run_on(ranks, __file__, counting=True, sizes=args.sizes)["points"]
+    else:
+        scenes = [(law, cell, "massless") for law in LAWS for cell in CELLS] + [("linear", "hexahedron", "massy")]
+        points = [cost(*one[:2], n, one[2]) for n in map(int, args.sizes.split(",")) for one in scenes]
+    alone = {(p["law"], p["cell"], p["contactors"], p["unknowns"]): p["step"] for p in points if p["ranks"] == 1}
+    for p in points if args.where == "apart" else ():
+        p["speed_up"] = alone.get((p["law"], p["cell"], p["contactors"], p["unknowns"]), np.nan) / p["step"]
+        print(
+            f"{p['law']:9} {p['cell']:12} {p['contactors']:9} {p['unknowns']:8d} unknowns, {p['ranks']} ranks: {1e3 * p['step']:.3g} ms, "
+            f"{p['over_residual']:.2f} x residual, contact {p['contact_share']:.0%}, {p['calls']} calls, speed-up {p['speed_up']:.2f}, "
+            f"cells {p['cells']}, messages {[sent.get('messages', 0) for sent in p['sent']]}"
+        )
+    if args.json and comm.rank == 0:
+        Path(args.json).write_text(json.dumps({"points": points, "machine": machine()}, indent=1) + "\n", encoding="utf-8")
