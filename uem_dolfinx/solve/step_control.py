@@ -120,15 +120,15 @@ class StepControl:
         """After a final failure, reset the length to its value before the failed step."""
         self.longest = self._longest_before
 
-    def done(self, iterations: Sequence[object], longer: float = 2.0, loops: int = 1) -> tuple[int, int]:
+    def done(self, iterations: Sequence[Any], longer: float = 2.0) -> tuple[int, int]:
         """Count a step that converged with this history; returns its number and the number of its cuts.
 
         Args:
-            iterations: the history.
+            iterations: the history, of one Newton loop or several, each of which ends without a linear solve.
             longer: by how much the next step may be longer if this one was easy, at least 1.
-            loops: number of Newton loops in the history.
         """
-        if len(iterations) - 1 <= EASY * loops:
+        solves = len(iterations) - 1
+        if solves <= EASY or solves <= EASY * [one.linear_iterations for one in iterations].count(0):
             self.longest *= longer
         self._longest_before = self.longest
         cuts, self._cuts, self.number = self._cuts, 0, self.number + 1

@@ -179,7 +179,6 @@ class AlongArc:
         tried: intended length of the last step, relative to the arc of all nominal steps.
         most: largest number of steps relative to the nominal one, before the path is given up.
         longer: whether the next step may be longer if this one was easy.
-        loops: number of Newton loops that make a step.
     """
 
     def __init__(self, problem: UnitedProblem, by: Dissipation | None = None):
@@ -196,7 +195,7 @@ class AlongArc:
         if by is not None:
             refuse_other_laws(problem.contacts, problem.materials)
         self._problem, self._arc, self._by = problem, ArcLength(problem), by
-        self.tried, self.most, self.longer, self.shorter, self.loops = 0.0, MOST_STEPS, 2.0, 0.5, 1
+        self.tried, self.most, self.longer, self.shorter = 0.0, MOST_STEPS, 2.0, 0.5
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
         """Take a step from the committed load factor ``done`` and commit it (collective).

@@ -82,10 +82,10 @@ class ByError(ByLoad):
 
     def __init__(self, problem: UnitedProblem, tolerance: float):
         super().__init__(problem)
-        self._tolerance, self.loops = tolerance, 2
+        self._tolerance = tolerance
 
     def _step(self, done: float, factor: float) -> list[Iteration]:
-        """Reach a load factor by two steps, after one has told their error, and commit these (collective)."""
+        """Reach a load factor by two steps, whose difference from one step is their error, and commit these (collective)."""
         problem, self.shorter = self._problem, 0.5
         turn = self._largest_turn(done, factor) if callable(problem.load) and depends_on_path(problem) else 0.0
         problem.set_load(done)

@@ -23,11 +23,10 @@ class ByLoad:
         most: largest number of steps relative to the nominal one, here unlimited.
         longer: by how much the next step may be longer if this one was easy.
         shorter: part to which this step is cut if it failed.
-        loops: number of Newton loops that make a step.
     """
 
     def __init__(self, problem: UnitedProblem):
-        self._problem, self.tried, self.most, self.longer, self.shorter, self.loops = problem, 0.0, np.inf, 2.0, 0.5, 1
+        self._problem, self.tried, self.most, self.longer, self.shorter = problem, 0.0, np.inf, 2.0, 0.5
         self._ramped = not callable(problem.load) and (problem.stage is None or problem.stage.step.ramp)
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:

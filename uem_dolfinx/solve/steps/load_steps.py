@@ -162,7 +162,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         progress.factor = factor
         if problem.solver.indefinite:
             unstable = factor
-        number, cuts = progress.control.done(iterations, way.longer, way.loops)
+        number, cuts = progress.control.done(iterations, way.longer)
         yield LoadStep(number, factor, iterations, cuts)
 
 
