@@ -115,8 +115,8 @@ def ask(what: str, f: Callable[..., T], *args: Any) -> T:
         raise
     except (Exception, GeneratorExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
-        beside = arrays.__file__, "<__array_function__ internals>"
-        last = next((one for one in reversed(frames) if one.filename not in beside), frames[-1])
+        not_theirs = arrays.__file__, "<__array_function__ internals>"
+        last = next((one for one in reversed(frames) if one.filename not in not_theirs), frames[-1])
         raise UserFunctionError(
             f"{what} raised {type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno}); mend the function"
         ) from error

@@ -94,7 +94,7 @@ def test_one_factorisation_serves_slipping_contactors(dim, monkeypatch):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_factor_serves_matrices_with_its_sign(sign):
-    """Only if none of their eigenvalues is negative beside the factorised matrix; it does not matter where Q is P."""
+    """Only if none of their eigenvalues is negative with respect to the factorised matrix; it does not matter where Q is P."""
     config, K, pc = identity(8)
     kept, P, Q = KeptFactor(config), united(config, []), united(config, [])
     kept.keep(pc, P, K, Q)

@@ -430,7 +430,7 @@ ANNOUNCED = {
 
 @pytest.mark.parametrize("what", ANNOUNCED)
 def test_refused_before_the_first_step(what):
-    """A history is told what it is for."""
+    """Controls that are announced before the first step."""
     feature, how, dynamics, wanted, words = ANNOUNCED[what]
     s = assembly(feature=feature, top=feature is not relation, **how)
     refused(uem.InputError, words, lambda: s.solve(1, True, dynamics, **wanted(s)))

@@ -309,7 +309,8 @@ def _eliminate(
     independent = UnitingEquations(node[pivot], direction, -h[k], np.ones(len(k), bool), row, node[column], -terms[row, column])
     redundant = np.ones(m, dtype=bool)
     redundant[k] = False
-    return Group(given, independent, shares, redundant, node, movable, ~redundant & False if pushing is None else pushing)
+    pushing = np.zeros(m, dtype=bool) if pushing is None else pushing
+    return Group(given, independent, shares, redundant, node, movable, pushing)
 
 
 def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: Ints) -> tuple[Ints, Ints, Array]:

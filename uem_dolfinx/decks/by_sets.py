@@ -160,10 +160,11 @@ class Closing:
         left = by_node = _histories(held)
         for where, dof in self._sets:
             nodes = nodes_of(self._deck, where)
+            own = set(nodes)
             # reference nodes of sections are no nodes of a body
             if all(by_node.get((one, dof)) == by_node.get((nodes[0], dof)) is not None for one in nodes):
                 yield (where if not where.isdigit() else [int(where)], dof), by_node[nodes[0], dof]
-                left = {at: history for at, history in left.items() if at[1] != dof or at[0] not in set(nodes)}
+                left = {at: history for at, history in left.items() if at[1] != dof or at[0] not in own}
         for dof in dict.fromkeys(dof for _, dof in left):
             of_dof = {one: history for (one, other), history in left.items() if other == dof}
             for nodes in _alike(of_dof):

@@ -180,7 +180,7 @@ class MortarKinematics(PlacedOnTarget):
     def curvature(self, state: PairState, along: Along | None = None) -> list[tuple[Ints, Array]]:
         """Second derivatives of the weighted gaps.
 
-        Friction of covered contactors turns, scales with the traction, and is handed to other nodes opposite (collective).
+        Friction of covered contactors turns, scales with the traction, and acts on other nodes opposite (collective).
         """
         of, rows = self.of, self.rows
         pressure = np.where(rows.covered, state.lam / np.where(rows.covered, rows.area, 1.0), 0.0)

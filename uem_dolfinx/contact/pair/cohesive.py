@@ -161,8 +161,8 @@ class CohesiveInterface(SofteningInterface):
         """See ``Interface``; bonds open along the normals of this state in the next step (collective)."""
         if self.trial.cohesion is not None:
             g = self.config.gdim
-            told = np.column_stack([self.trial.cohesion[:, :-g], self.kinematics.projection.normal])
-            self.trial, self._first = replace(self.trial, cohesion=told), None
+            states = np.column_stack([self.trial.cohesion[:, :-g], self.kinematics.projection.normal])
+            self.trial, self._first = replace(self.trial, cohesion=states), None
         super().commit()
         self._rub()
 

@@ -60,7 +60,7 @@ class Bonds(Tie):
         return np.zeros(0)
 
     def largest_gap_here(self) -> float:
-        """See ``Readings``; openings are no violations."""
+        """See ``Interface``; openings are no violations."""
         return 0.0
 
     # -- openings and forces ---------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ class Bonds(Tie):
         return contact._replace(force=contact.force + self._on_contactors(self.multipliers), bond=self.multipliers)
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
-        """See ``Readings``."""
+        """See ``Interface``."""
         return None if self.rows is None else self.rows.handed_on(self._equations(), self.multipliers)
 
     def join(self, contact: ContactRows) -> ContactRows:
@@ -121,7 +121,7 @@ class Bonds(Tie):
         )
 
     def pressing(self, state: PairState, n: Array, lam: Array, tau: Array) -> tuple[Array, Array]:
-        """See ``Readings``; contact forces with those of the bonds, which may be in tension (collective)."""
+        """See ``Interface``; contact forces with those of the bonds, which may be in tension (collective)."""
         if self.rows is None or state.bond is None:
             return lam, tau
         force = np.column_stack([self.discretisation.spread(part) for part in (state.bond * self.rows.share).T])
@@ -129,5 +129,5 @@ class Bonds(Tie):
         return lam + along, tau + force - along[:, None] * n
 
     def areas(self, areas: Array, reference: Array, found: Array) -> Array:
-        """See ``Readings``; those of contact."""
+        """See ``Interface``; those of contact."""
         return found

@@ -137,7 +137,7 @@ class Preloaded(Tie):
 
     @property
     def chained(self) -> bool:
-        """See ``Readings``; True, since all rows depend on the contactor of the leading row."""
+        """See ``Interface``; True, since all rows depend on the contactor of the leading row."""
         return True
 
     def _equations(self) -> UnitingEquations:
@@ -209,7 +209,7 @@ class Preloaded(Tie):
         return not self.locked or self.shortened
 
     def applied_forces(self, force: float | None = None) -> tuple[Ints, Array] | None:
-        """See ``Readings``; the pair of forces on the faces, by default the given one, while the opening is free (collective)."""
+        """See ``Interface``; the pair of forces on the faces, by default the given one, while the opening is free (collective)."""
         if self.locked:
             return None
         assert self.rows is not None

@@ -260,7 +260,7 @@ class Tie:
 
     @property
     def chained(self) -> bool:
-        """See ``Readings``; here because of the tie."""
+        """See ``Interface``; here because of the tie."""
         return False
 
     @property
@@ -269,13 +269,13 @@ class Tie:
         return False
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
-        """See ``Readings``."""
+        """See ``Interface``."""
         return None
 
     # -- results ---------------------------------------------------------------------------------------------------------
 
     def pressing(self, state: PairState, n: Array, lam: Array, tau: Array) -> tuple[Array, Array]:
-        """See ``Readings``; from contact forces and normals ``(n, gdim)``, with tied contactors, which may be in tension (collective)."""
+        """See ``Interface``; from contact forces and normals ``(n, gdim)``, with tied contactors, which may be in tension (collective)."""
         if self.rows is None or state.bond is None:
             return lam, tau
         force = state.bond * self.rows.share
@@ -284,7 +284,7 @@ class Tie:
         return np.where(self.tied, along, lam), np.where(self.tied[:, None], force - along[:, None] * n, tau)
 
     def areas(self, areas: Array, reference: Array, found: Array) -> Array:
-        """See ``Readings``; from the areas of contact ``found (n,)`` (collective)."""
+        """See ``Interface``; from the areas of contact ``found (n,)`` (collective)."""
         if self.rows is None:
             return found
         if self.rows.area is None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 #: Multiple of the rounding of K u that the residual may be left with.
 #: [derived; rounding of K u; test_bodies.py::test_rounding_of_forces]
 FORCE_ROUNDING = 4.0 * np.finfo(float).eps
-#: A force is told from rounding where it is larger by this factor.
+#: A force is more than rounding where it is larger by this factor.
 #: [convention; rounding of K u; test_bodies.py::test_forces_above_rounding]
 ABOVE_ROUNDING = 100.0
 #: Dirichlet values are met if they are to this part of the largest.

@@ -121,7 +121,7 @@ class Exchanges:
 
     @staticmethod
     def climbs(solver: UnitedSolver, step: Increment) -> bool:
-        """Whether the matrix of the last solve has negative eigenvalues, as far as its factors or the solution tell (collective)."""
+        """Whether the matrix of the last solve has negative eigenvalues, as far as its factors or the solution show (collective)."""
         return solver.indefinite or solver.negative if solver.exact else solver.space.work(step.dq, step.rhs) < 0.0
 
     @contextmanager

@@ -265,8 +265,8 @@ class BodySystem:
             trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
         gaps = [one.largest_gap_here() for one in (*self.near, self.linear) if one is not None]
         united = sum(int(pair.united.sum()) for pair in self.near)
-        told = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
-        return trial, *slip_terms(self.near, self.unknowns.vector(), self.linear, convex), int(told[:, 0].sum()), told[:, 1].max()
+        each = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
+        return trial, *slip_terms(self.near, self.unknowns.vector(), self.linear, convex), int(each[:, 0].sum()), each[:, 1].max()
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state with an active set changed where gaps and forces, both to first order, violate contact conditions (collective)."""
@@ -344,7 +344,7 @@ class BodySystem:
 
     def _take(self, forces: list[Traction]) -> None:
         """Store the contact forces in the pairs."""
-        for pair, own in filter(lambda told: told[0].asked, zip(self.pairs, forces)):
+        for pair, own in ((pair, own) for pair, own in zip(self.pairs, forces) if pair.asked):
             pair.set_forces(own)
         if self.linear is not None:
             self.linear.multipliers = self._multipliers
