@@ -27,12 +27,10 @@ class Crossing(NamedTuple):
     Attributes:
         depth: a length.
         place: middle of the crossing ``(3,)``.
-        n_pairs: number of pairs of edges that cross, counted for both facets of each edge.
     """
 
     depth: float
     place: Array
-    n_pairs: int
 
 
 class SharpEdges:
@@ -101,9 +99,8 @@ def find_crossing(own: SharpEdges, theirs: SharpEdges, keys: tuple[Ints, Ints], 
         depth, place = depth[deep], place[deep]
     k = int(np.argmax(depth)) if len(depth) else -1
     best = gathered(comm, np.append(depth[k], place[k]) if k >= 0 else np.zeros(4))
-    count = int(reduced(comm, len(depth)))
     deepest = best[int(np.argmax(best[:, 0]))]
-    return Crossing(float(deepest[0]), deepest[1:], count) if count else None
+    return Crossing(float(deepest[0]), deepest[1:]) if deepest[0] else None
 
 
 def _balls(x: Array) -> tuple[Array, Array]:
