@@ -80,10 +80,19 @@ def symbolic(value: Any) -> bool:
     return isinstance(value, Expr) or (isinstance(value, list | tuple) and any(map(symbolic, value)))
 
 
+def truth(value: Any) -> bool:
+    """Whether a value is True or False, or a list with one; Python counts them among the whole numbers."""
+    return isinstance(value, (bool, np.bool_)) or (isinstance(value, list | tuple) and any(map(truth, value)))
+
+
 def numbers(value: Any) -> Array:
-    """Copy of a value as an array of numbers; TypeError, as of other objects, for expressions of UFL, whose conversion never ends."""
-    if symbolic(value):
-        raise TypeError("an expression of UFL is no number")
+    """Copy of a value as an array of numbers.
+
+    Raises:
+        TypeError: as of other objects, for expressions of UFL, whose conversion never ends, and for True and False.
+    """
+    if symbolic(value) or truth(value):
+        raise TypeError("an expression of UFL, or True or False, is no number")
     return np.array(value, dtype=float)
 
 
@@ -116,7 +125,7 @@ def number(what: str, value: Any, within: Range = FINITE) -> float:
         InputError: if it is out of the range.
     """
     words = sentence(what, value, within.words, within.remedy)
-    if symbolic(value) or isinstance(value, (str, bytes, bool, np.bool_)) or np.ndim(value):
+    if symbolic(value) or truth(value) or isinstance(value, (str, bytes)) or np.ndim(value):
         raise InputTypeError(words)
     try:
         x = float(value)

@@ -89,9 +89,10 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
         )
     if part and size > 1 and component is None:
         raise InputError(
-            f"component is None: expected one of 0 to {size - 1} for a part of a mixed space; make a condition for each"
+            f"component is None: expected one of 0 to {size - 1} for a part of a mixed space; make a condition for each, as "
+            f"[uem.dirichlet(V, tag, i) for i in range({size})]"
         )
-    if component is not None and component not in range(size):
+    if component is not None and (given.truth(component) or component not in range(size)):
         raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
     n = size if component is None else 1
     if isinstance(value, list | tuple) and given.symbolic(value):
@@ -117,7 +118,8 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
         except (TypeError, ValueError):
             array = None
         expected = "a number, or a Constant or a Function, or numbers for all components"
-        given.kind("the value of a Dirichlet condition", value, array is not None and value is not None, expected)
+        fits = array is not None and value is not None and not given.truth(value)
+        given.kind("the value of a Dirichlet condition", value, fits, expected)
         if array.ndim == 0 and n > 1 and not isinstance(value, fem.Constant):
             array = np.full(n, array)
         if array.shape != ((n,) if n > 1 else ()):

@@ -129,6 +129,9 @@ def test_physical_points():
         (uem.InputError, "stiffness", lambda: uem.PointSpring(tags[point], -1.0)),
         (uem.InputError, "stiffness", lambda: uem.PointSpring(tags[point], [[1.0, 2.0], [0.0, 1.0]])),
         (uem.InputTypeError, "stiffness", lambda: uem.PointSpring(tags[point], "hard")),
+        (uem.InputTypeError, "stiffness = True", lambda: uem.PointSpring(tags[point], True)),
+        (uem.InputError, "stiffness = [1.0]", lambda: uem.PointSpring(tags[point], [1.0])),
+        (uem.InputError, "stiffness = []", lambda: uem.PointSpring(tags[point], [])),
         (uem.InputError, "stiffness", lambda: loads(uem.PointSpring(tags[point], (1.0, 1.0, 1.0)))),
     ):
         refused(error, words, call)

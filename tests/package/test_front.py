@@ -153,9 +153,39 @@ def test_spaces():
         (uem.function_space(mesh, ("DG", 0), (2, 2)), uem.function_space(mesh, ["DG", 0, (2, 2)])),
     ):
         assert ours.ufl_element() == theirs.ufl_element()
-    for element in ("Lagrange", ("Lagrange",), (1, "Lagrange"), 1.5):
+    for element in (
+        "Lagrange",
+        ("Lagrange",),
+        (1, "Lagrange"),
+        1.5,
+        True,
+        ("Lagrange", True),
+        ("Lagrange", 1.5),
+        ("Lagrange", "1"),
+    ):
         with pytest.raises(ValueError, match="expected a degree"):
             uem.function_space(mesh, element)
+    refused(uem.InputError, "shape = (True,)", lambda: uem.function_space(mesh, 1, (True,)))
+
+
+def test_true_is_no_number():
+    """Python counts True among the numbers; here it is refused by name, alone and in vectors."""
+    b = blocks(COMM, "triangle")
+    V, low, high = b.u.function_space, b.low, b.high
+    place = (0.0, 0.0)
+    for words, call in (
+        ("force = (True, 0.0)", lambda: uem.PointLoad(place, (True, 0.0))),
+        ("b = True", lambda: uem.Equation([(place, (0, 1))], b=np.True_)),
+        ("the vector of terms[0]", lambda: uem.Equation([(place, (0, True))])),
+        ("jump = [True, 0.0]", lambda: uem.periodic(high, low, jump=[True, 0.0])),
+        ("the value of a Dirichlet condition", lambda: uem.dirichlet(V, b.bottom, value=(True, 1.0))),
+    ):
+        refused(uem.InputTypeError, words, call)
+    refused(uem.InputError, "component = True", lambda: uem.dirichlet(V, b.bottom, True))
+    refused(uem.MassError, "density True", lambda: uem.lumped_mass(V, True))
+    refused(uem.InputError, "adjust = inf", lambda: uem.Contact(high, low, adjust=np.inf))
+    W = uem.function_space(b.scene.mesh, [("Lagrange", 2, (2,)), 1])
+    refused(uem.InputError, "[uem.dirichlet(V, tag, i) for i in range(2)]", lambda: uem.dirichlet(W.sub(0), b.bottom))
 
 
 # -- surfaces ----------------------------------------------------------------------------------------------------------

@@ -77,8 +77,9 @@ class PointSpring(given.Sealed):
             self._stiffness = given.numbers(stiffness)
         except (TypeError, ValueError):
             raise InputTypeError(given.sentence("stiffness", stiffness, words)) from None
-        k = np.diag(np.atleast_1d(self._stiffness)) if self._stiffness.ndim < 2 else self._stiffness
-        square = k.ndim == 2 and k.shape[0] == k.shape[1] <= 3 and bool(np.isfinite(k).all())
+        k = self._stiffness * np.eye(2) if self._stiffness.ndim == 0 else self._stiffness
+        k = np.diag(k) if k.ndim == 1 else k
+        square = k.shape in ((2, 2), (3, 3)) and bool(np.isfinite(k).all())
         if not square or not np.array_equal(k, k.T) or np.linalg.eigvalsh(k)[0] < -np.finfo(float).eps * np.abs(k).max():
             raise InputError(given.sentence("stiffness", stiffness, words))
 

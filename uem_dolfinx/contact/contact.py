@@ -59,7 +59,7 @@ MAX_PENETRATION = 0.05
 COUPLINGS: tuple[Literal["node_to_surface", "mortar"], ...] = ("node_to_surface", "mortar")
 AFTER: tuple[Literal["after"]] = ("after",)
 BOUND = given.Range("0 or a positive length, or None for 5 % of the model's size", lambda x: x >= 0)
-OF_ADJUST = given.Range("True, False or a positive length", lambda x: x > 0)
+OF_ADJUST = given.Range("True, False or a positive length", given.POSITIVE.holds)
 THICKNESS = given.Range("a positive length, or None for a body without back", lambda x: x > 0)
 
 

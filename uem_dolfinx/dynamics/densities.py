@@ -9,7 +9,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from uem_dolfinx import compat, forms
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import MassError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -19,7 +19,7 @@ from uem_dolfinx.parallel import agree
 
 def as_density(config: Configuration, rho: Any) -> Any:
     """The density as a UFL expression that forms can contain."""
-    if isinstance(rho, (Real, ufl.constantvalue.ConstantValue)):
+    if isinstance(rho, (Real, ufl.constantvalue.ConstantValue)) and not given.truth(rho):
         # UFL drops terms with a literal zero
         return fem.Constant(config.mesh, float(rho))
     if not isinstance(rho, ufl.core.expr.Expr):

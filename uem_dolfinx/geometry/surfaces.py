@@ -186,6 +186,6 @@ def check_distinct(config: Configuration, contactor: Indices, target: TargetFace
     if len(shared):
         error = SurfaceError(
             f"contactor '{names[0]}' and target '{names[1]}' share the node at {config.describe(int(shared[0]))}: "
-            "give each body its own nodes and its own surface"
+            "give each body its own nodes and its own surface; a body touches itself in GeneralContact(self_contact=True)"
         )
     agree(config.comm, error)
