@@ -117,5 +117,6 @@ with uem.figure(args.plot, comm, size=(5.0, 3.4)) as (panel,):
         panel.legend(frameon=False)
 
 # %%
-assert results["pull_off_error"] < (0.03 if args.coupling == "mortar" else 0.05) and results["radius_error"] < 0.08, results
+assert results["pull_off_error"] < (0.045 / args.strength if args.coupling == "mortar" else 0.05), results
+assert results["radius_error"] < 0.08, results
 assert results["balance"] < 1e-6, results
