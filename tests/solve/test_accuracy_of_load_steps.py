@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import refused
+from helpers import at, box, linear, refused, scene
 from ramp_scenes import COMM, forming, ramped
 
 import uem_dolfinx as uem
@@ -95,6 +95,25 @@ def test_a_load_that_turns():
     assert abs(found / exact - 1) < 0.1 and sum(step.cuts for step in steps) > 0
     straight, steps = turning(3e-3, lambda f: f)
     assert abs(straight / exact - 1) < 3e-3 and len(steps) == 1
+
+
+def test_a_rigid_floor_that_turns():
+    """A block on a floor that goes to and fro twice, with zeros at ends and middle of the step, slips: friction is at its limit."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [2, 2])])
+    V, floor, way = uem.function_space(s.mesh, 1, (2,)), uem.RigidPlane([0.0, 0.0], [0.0, 1.0]), 0.05
+    u, top = fem.Function(V), s.tag("top", 0, at(1, 1.0))
+    contact = uem.Contact(s.tag("low", 0, at(1, 0.0)), floor, friction=0.01)
+    bcs = [uem.dirichlet(V, top, 0), uem.dirichlet(V, top, 1, value=-0.02)]
+
+    def load(t):
+        floor.move([way * np.sin(2.0 * np.pi * t) ** 2, 0.0])
+
+    problem = uem.UnitedProblem(linear(u, 1.0, 0.3), u, bcs=bcs, contacts=[contact], load=load)
+    problem.set_load(0.0)
+    problem.solve()
+    list(uem.load_steps(problem, 1, tolerance=3e-3))
+    friction, force = contact.resultant().force
+    assert force > 0.0 and friction == pytest.approx(-0.01 * force, rel=1e-6)
 
 
 def test_without_history():

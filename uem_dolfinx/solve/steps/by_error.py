@@ -45,10 +45,17 @@ class Reached:
 
     @classmethod
     def loaded(cls, problem: UnitedProblem, factor: float) -> Reached:
-        """Dirichlet values, and forces at the committed displacement, under the load of a factor (collective)."""
+        """Dirichlet values, and forces at the committed displacement, under the load of a factor (collective).
+
+        Active contactors on rigid surfaces have the opposite of the displacement of these, which slip depends on.
+        """
         problem.set_load(factor)
         there, n, bodies = cls.of(problem), problem.config.n_owned, problem.bodies
         values = problem.config.of(np.where(bodies.held, values_at(problem.committed, bodies.bcs), problem.committed))[:n]
+        for pair, before in zip(problem.interfaces, problem.motions):
+            now, x, active = pair.target.motion, pair.points, pair.committed.active
+            X = x if before is None else before.back(x)
+            values[pair.nodes[active]] += (x - (X if now is None else now.carry(X)))[active]
         return cls(values, there.forces)
 
     def apart(self, other: Reached, stiffness: Array) -> Array:
@@ -117,13 +124,13 @@ class ByError(ByLoad):
         for ends in ((done, 0.5 * (done + factor)), (0.5 * (done + factor), factor)):
             first, *others = [Reached.loaded(problem, float(at)) for at in np.linspace(*ends, LOOKS + 1)]
             away = np.array([one.away(first, stiffness).ravel() for one in others])
-            dots = reduced(problem.comm, away @ away.T)
-            way = dots[-1, -1]
-            along = dots[-1] / way if way else np.zeros(LOOKS)
+            dots = reduced(problem.comm, away @ away[-1])
+            way = dots[-1]
+            along = dots / way if way else np.zeros(LOOKS)
             nearest = np.clip(along, 0.0, 1.0)
-            apart = np.diag(dots) - 2.0 * nearest * dots[-1] + nearest**2 * way
+            apart = reduced(problem.comm, ((away - nearest[:, None] * away[-1]) ** 2).sum(axis=1))
             back = np.maximum.accumulate(along) - along
-            found = max(found, float(np.abs(apart).max()), float(back.max()) ** 2 * float(way))
+            found = max(found, float(apart.max()), float(back.max()) ** 2 * float(way))
         return float(np.sqrt(found))
 
     def _refuse_error(self, start: Reached, at_once: Reached, halves: Reached, length: float, turn: float) -> None:
