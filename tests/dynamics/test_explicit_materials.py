@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, box, scene
+from helpers import at, box, scene, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -74,6 +74,29 @@ def test_cells_that_are_flattened():
     assert stepper.steps_to_look(1e-3, 0.0) == 14
     assert stepper.steps_to_look(1e-3, 0.05) == 7
     assert stepper.steps_to_look(1.0, 0.0) == 0 == stepper.steps_to_look(1e-3, 0.2)
+
+
+@pytest.mark.parametrize("contactors", ["massy", slow("massless")])
+def test_rubber_at_the_speed_of_its_waves(contactors):
+    """Edges of crushed cells are stretched by at most a tenth in a step, and energy neither grows nor falls."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 7.0], [1, 7])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    rubber = uem.NeoHooke(1.0, 0.0, "plane_strain")
+    foot = uem.Contact(s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
+    scheme = uem.CentralDifferences(safety=0.3)
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=(0.0, -1.0), scheme=scheme, contactors=contactors)
+    problem = uem.UnitedProblem(rubber.residual(u, ufl.TestFunction(V)) * ufl.dx, u, contacts=[foot], dynamics=dynamics)
+    stepper, strains, lengths = ExplicitStepper(problem), [], None
+    book = uem.EnergyBook(problem, rubber.energy(u) * ufl.dx)
+    for step in uem.time_steps(problem, end=1.5):
+        book.write(step)
+        before, lengths = lengths, stepper._lengths(problem.config.x)
+        if step.number > 5:
+            strains.append(float(np.abs(lengths / before - 1).max(initial=0.0)))
+    strain = COMM.allreduce(max(strains), op=MPI.MAX)
+    assert 0.03 < strain < 0.11
+    assert max(abs(row.defect) for row in book.rows) < 2e-3 * book.rows[0].kinetic
 
 
 def test_yielded_bars_have_the_critical_step_of_unloading():

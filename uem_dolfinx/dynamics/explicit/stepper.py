@@ -37,6 +37,9 @@ CHECKED_EVERY = 50
 #: inversion before nodes move by this part of the shortest edge against each other.
 #: [convention; strain; test_explicit_materials.py::test_cells_that_are_flattened]
 CHECKED_STRAIN = 0.1
+#: A step stretches no edge of a vibration by more than this part: stiffnesses that change within a step make or take energy.
+#: [convention; strain; test_explicit_materials.py::test_rubber_at_the_speed_of_its_waves]
+STEADY_STRAIN = 0.1
 #: A run ends where the shortest edge of all cells falls below this part of the mesh's shortest one: cells collapse, and steps with them.
 #: [bound; the shortest edge; -]
 COLLAPSED = 1e-3
@@ -271,6 +274,22 @@ class ExplicitStepper:
         strain = dt * self.rate
         left = max(CHECKED_STRAIN - stretch, 0.0)
         return int(min(left / strain, CHECKED_EVERY)) if strain > 0.0 else CHECKED_EVERY
+
+    def steady_step(self, critical: float) -> float:
+        """Longest step in which no edge is stretched further than it may, so that stiffnesses hardly change (collective).
+
+        An edge of the highest frequency, ``2 / critical``, vibrates with rates up to ``sqrt(v^2 + (a critical / 2)^2)``, in any phase.
+        """
+        config, dynamics = self.problem.config, self.dynamics
+        if self.problem.bodies.linear or not np.isfinite(critical):
+            return np.inf
+        along = config.x[self._edges[0]] - config.x[self._edges[1]]
+        nodal = (of.x.array.reshape(-1, config.gdim) for of in (dynamics.velocity, dynamics.acceleration))
+        # turning does not stretch
+        v, a = (((of[self._edges[0]] - of[self._edges[1]]) * along).sum(axis=1) for of in nodal)
+        rates = np.hypot(v, 0.5 * critical * a) / (along**2).sum(axis=1)
+        fastest = float(reduced(self.problem.comm, float(rates.max(initial=0.0)), op=MPI.MAX))
+        return STEADY_STRAIN / fastest if fastest > 0.0 else np.inf
 
     def _highest(self, apply: Callable[[Array], Array]) -> float:
         config, mass = self.problem.config, self._mass * self.moving

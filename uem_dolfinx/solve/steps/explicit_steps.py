@@ -26,7 +26,7 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         end: time to reach.
 
     Raises:
-        InputError: if ``dt`` exceeds the critical step.
+        InputError: if ``dt`` exceeds the critical step, or stretches cells too far.
     """
     control, dynamics = problem.step_control, problem.dynamics
     kind: type[ExplicitStepper] = ExplicitStepper
@@ -71,7 +71,7 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         before, found = after, (pattern := stepper.pattern()) != last
         if due or found:
             control.stretch, control.shortest = stepper.look(control.stretch), stepper.shortest
-        if found or (due and not stepper.steps_to_look(length, control.stretch)):
+        if end - dynamics.time > LEFT * length and (found or (due and not stepper.steps_to_look(length, control.stretch))):
             length, control.stretch = _length(stepper, dt, end), 0.0
             control.begin(length)
         if due or found:
@@ -82,19 +82,24 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
 
 
 def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:
-    """Length of steps that divide the time to the end; InputError for a given one beyond the critical step (collective)."""
+    """Length of steps that divide the time to the end; InputError for a given one that is too long (collective)."""
     critical, dynamics = stepper.critical_step(), stepper.dynamics
+    steady = stepper.steady_step(critical)
     if dt is not None:
-        if dt > critical:
+        if dt > min(critical, steady):
+            limit = (
+                f"critical step {critical:.4g} of central differences"
+                if dt > critical
+                else f"{steady:.4g} that hardly stretch cells"
+            )
             raise InputError(
-                f"dt = {dt:.6g} at time {dynamics.time:.6g}: expected no more than the critical step {critical:.4g} of central "
-                "differences; take shorter steps, or dt=None"
+                f"dt = {dt:.6g} at time {dynamics.time:.6g}: expected no more than the {limit}; take shorter steps, or dt=None"
             )
         return dt
     longest, control = dynamics.scheme.safety * critical, stepper.problem.step_control
     if stepper.part < 1.0:
         control.resolved = min(control.resolved, stepper.part * longest)
-    longest = min(longest, control.resolved)
+    longest = min(longest, control.resolved, steady)
     remainder = end - dynamics.time
     # the same on any ranks: rounding of the critical step does not change the number of steps
     length = remainder / max(np.ceil(remainder / longest - LEFT), 1.0)

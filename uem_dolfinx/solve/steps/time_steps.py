@@ -70,7 +70,7 @@ def time_steps(
         An iterator of converged steps.
 
     Raises:
-        InputError, InputTypeError: if ``dt`` is not positive, beyond the critical step of an explicit scheme, or smaller than the
+        InputError, InputTypeError: if ``dt`` is not positive, too long for an explicit scheme, or smaller than the
             rounding error of the time; if ``end`` is before the start or not finite, or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
