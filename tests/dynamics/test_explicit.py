@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from flight_scenes import ATTEMPT, Flight
 from helpers import at, box, clamp, scene
 
 import uem_dolfinx as uem
@@ -27,92 +28,6 @@ from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.united import system
 
 COMM = MPI.COMM_WORLD
-#: Without the checks of every state, which assemble residuals.
-ATTEMPT = uem.UnitedProblem.attempt
-SHAPES = {2: "quadrilateral", 3: "hexahedron"}
-
-
-class Flight:
-    """Bars along the last axis, of length 10, density 1 and wave speed 30, that fly downwards onto a wall or onto each other.
-
-    Args:
-        dim: of space.
-        cells: along each bar.
-        speed: of the uppermost bar.
-        gap: below each bar.
-        bars: their number; the lower of two stands on nothing.
-        law: of both.
-        impedance: of the lower of two bars over that of the upper, at the same wave speed.
-        nu: Poisson's ratio.
-        pose: of the mesh, see ``scene``.
-        move: displacement of the wall by the time.
-        how: arguments of the contact.
-    """
-
-    def __init__(
-        self,
-        dim=2,
-        cells=40,
-        speed=10.0,
-        gap=0.5,
-        bars=1,
-        law=uem.LinearElastic,
-        impedance=1.0,
-        nu=0.0,
-        pose=lambda x: x,
-        move=None,
-        **how,
-    ):
-        across = [1.0] * (dim - 1)
-        places = [gap, 10.0 + 2 * gap][:bars]
-        parts = [
-            box(SHAPES[dim], [*[0.0] * (dim - 1), y], [*across, y + 10.0], [*[1 + k] * (dim - 1), cells])
-            for k, y in enumerate(places)
-        ]
-        self.scene, self.dim = scene(COMM, SHAPES[dim], parts, pose=pose), dim
-        V = compat.function_space(self.scene.mesh, 1, (dim,))
-        self.u, v, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
-        self.split = 10.0 + 1.5 * gap if bars == 2 else -1.0
-        upper = V.tabulate_dof_coordinates()[:, dim - 1] > self.split
-        velocity.x.array.reshape(-1, dim)[upper, dim - 1] = -speed
-        x = ufl.SpatialCoordinate(self.scene.mesh)
-        density = ufl.conditional(ufl.lt(x[dim - 1], self.split), impedance, 1.0)
-        material = law(900.0 * density, nu, kind="plane_stress" if dim == 2 else "3d")
-        self.dynamics = uem.Dynamics(uem.lumped_mass(V, density), velocity=velocity, scheme=uem.CentralDifferences())
-        bottom = self.scene.tag("bottom", bars - 1, at(dim - 1, places[-1]))
-        plane = uem.RigidPlane(np.zeros(dim), np.eye(dim)[-1])
-        load = None if move is None else lambda at: plane.move(move(at))
-        target = plane if bars == 1 else self.scene.tag("top", 0, at(dim - 1, places[0] + 10.0))
-        self.contact = uem.Contact(bottom, target, name="touch", **how)
-        #: Load along the last axis, by volume.
-        self.pull = fem.Constant(self.scene.mesh, 0.0)
-        self.problem = uem.UnitedProblem(
-            (material.residual(self.u, v) - self.pull * v[dim - 1]) * ufl.dx,
-            self.u,
-            contacts=[self.contact],
-            dynamics=self.dynamics,
-            rtol=1e-12,
-            load=load,
-        )
-        self.stored = material.energy(self.u) * ufl.dx
-        self.rows = []
-
-    def run(self, end, dt=None, **how):
-        """Columns time, force, sum of energies over the first, momentum along the last axis."""
-        book = uem.EnergyBook(self.problem, self.stored)
-        for step in uem.time_steps(self.problem, dt, end, **how):
-            row = book.write(step)
-            energy = (row.kinetic + row.stored) / book.rows[0].kinetic
-            self.rows.append((row.time, self.contact.resultant().force[-1], energy, book.momenta[-1][-1]))
-            self.last = step
-        self.book = book
-        return np.array(self.rows).T
-
-    @property
-    def size(self):
-        """Norm of the displacement (collective)."""
-        own = self.u.x.array[: self.problem.config.n_owned * self.dim]
-        return float(np.sqrt(reduced(COMM, float(own @ own))))
 
 
 @pytest.mark.parametrize(("dim", "law", "speed", "within"), [(2, uem.LinearElastic, 10.0, 5e-3), (3, uem.LinearElastic, 10.0, 5e-3),
@@ -410,47 +325,6 @@ def test_supports_and_gravity():
     highest = COMM.allreduce(u.x.array.max(initial=-np.inf), MPI.MAX)
     assert highest == pytest.approx(0.1 * np.sin(3.0) ** 2)
     assert abs(row.defect) < 1e-2 * max(r.kinetic + r.stored for r in book.rows)
-
-
-@pytest.mark.parametrize("law", [uem.NeoHooke, uem.LinearElastic])
-@pytest.mark.parametrize("stop", [9, 15])
-def test_it_goes_on_from_a_checkpoint(tmp_path, law, stop):
-    """A run that stops before or during contact and goes on has the steps of the one that does not, and on one rank its last bits."""
-    path = COMM.bcast(str(tmp_path / "run.h5") if COMM.rank == 0 else None)
-    whole, first, again = (Flight(2, 12, law=law, friction=0.3, speed=14.0) for _ in range(3))
-    every = [(step.number, step.dt) for step in uem.time_steps(whole.problem, None, 0.6)]
-    for step in uem.time_steps(first.problem, None, 0.6, checkpoint=uem.Checkpoint(path, every=5)):
-        if step.number == stop:
-            break
-    later = [
-        (step.number, step.dt) for step in uem.time_steps(again.problem, None, 0.6, checkpoint=uem.Checkpoint(path, every=5))
-    ]
-    assert later == every[stop:] or (COMM.size > 1 and len(later) == len(every) - stop)
-    for one, other in ((again.u, whole.u), (again.dynamics.velocity, whole.dynamics.velocity)):
-        change = np.abs(one.x.array - other.x.array).max(initial=0.0)
-        assert change == 0.0 or (COMM.size > 1 and change <= 1e-11 * np.abs(other.x.array).max(initial=1.0))
-
-
-def test_steps_shortened_by_a_refusal_stay_short(monkeypatch, tmp_path):
-    """Steps are shorter from a refused one on, also in a run that goes on from a checkpoint after it."""
-    path, step, limit = COMM.bcast(str(tmp_path / "run.h5")), ExplicitStepper.step, []
-
-    def refusing(self, dt):
-        limit[:] = limit or [0.5 * dt]
-        if self.problem.step_control.number == 3 and dt > limit[0]:
-            self.limit = limit[0]
-            raise uem.StepAccuracyError("too long")
-        return step(self, dt)
-
-    monkeypatch.setattr(ExplicitStepper, "step", refusing)
-    whole, first, again = (Flight(2, 6, law=uem.NeoHooke, gap=9.0) for _ in range(3))
-    every = [(step.number, step.dt) for step in uem.time_steps(whole.problem, end=0.4)]
-    assert every[-2][1] == 0.9 * limit[0] and len(every) > 10
-    for taken in uem.time_steps(first.problem, end=0.4, checkpoint=uem.Checkpoint(path, every=5)):
-        if taken.number == 5:
-            break
-    later = [(step.number, step.dt) for step in uem.time_steps(again.problem, end=0.4, checkpoint=uem.Checkpoint(path, every=5))]
-    assert later == every[5:]
 
 
 REFUSED = {

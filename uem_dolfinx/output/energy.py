@@ -182,11 +182,12 @@ class EnergyBook(Closing, given.Sealed):
         u, forces, resultants, time, driven = self._u, self._forces, self._resultants, self._time, self._driven
         before = self._at_points
         self._read_forces()
-        works, impulse = 0.5 * (forces + self._forces) @ (self._u - u), 0.5 * (resultants + self._resultants)
+        # NumPy's sums do not depend on where arrays lie in memory, those of BLAS do
+        works, impulse = 0.5 * ((forces + self._forces) * (self._u - u)).sum(axis=1), 0.5 * (resultants + self._resultants)
         if self._struck and self._time - time <= 1.5 * (dt := self.dynamics.dt):
             # the forces act between the mean velocities of two steps
             rate, self._rate = self._rate, (self._u - u) / dt
-            works[2:], impulse = 0.5 * dt * self._forces[2:] @ (rate + self._rate), self._resultants
+            works[2:], impulse = 0.5 * dt * (self._forces[2:] * (rate + self._rate)).sum(axis=1), self._resultants
         works[1] += self._driven - driven + works[3]
         self._works += reduced(self.problem.comm, works[:3])
         pairs = zip(before, self._at_points)
