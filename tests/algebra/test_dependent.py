@@ -433,9 +433,11 @@ def test_forces_of_dependent_rows_do_not_pull(in_cone, seed):
     every = np.ones(len(x), bool)
     group = _eliminate(A.copy(), np.zeros(len(x)), free, np.arange(len(x) + n), np.arange(len(x)), None, every)
     assert group.redundant.sum() == len(x) - n
-    loads = weight.T @ np.where(rng.random(len(x)) < 0.3, rng.random(len(x)), 0.0) if in_cone else rng.normal(size=n)
-    least = np.linalg.pinv(weight.T) @ loads
-    assert least.min() < 0.0
+    least = np.zeros(len(x))
+    while least.min() >= 0.0:
+        # loads for which the least norm pulls
+        loads = weight.T @ np.where(rng.random(len(x)) < 0.3, rng.random(len(x)), 0.0) if in_cone else rng.normal(size=n)
+        least = np.linalg.pinv(weight.T) @ loads
     lam = group.forces(np.linalg.lstsq(group.shares, least, rcond=None)[0])
     left = weight.T @ np.maximum(lam, 0.0) - loads
     if in_cone:
