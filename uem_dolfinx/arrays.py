@@ -25,6 +25,11 @@ def replace(of: T, /, **changed: Any) -> T:
     return new
 
 
+def is_whole(value: Any) -> bool:
+    """Whether a value is a whole number; True and False, which Python counts among these, are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
 def sums_of_rows(places: Ints, values: Array, size: int) -> Array:
     """Sums of the rows of ``values (m, k)`` with the same index in ``places (m,)``: ``(size, k)``; a faster ``numpy.add.at``."""
     k = values.shape[1]

@@ -20,6 +20,7 @@ import ufl
 from dolfinx import cpp, fem, io, la, mesh
 from petsc4py import PETSc
 
+from uem_dolfinx.arrays import is_whole
 from uem_dolfinx.compiled import forget_logging_of_ffcx, kept
 from uem_dolfinx.errors import InputError, MissingBackendError
 
@@ -131,13 +132,18 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
     """
     if isinstance(element, list) and len(element) > 1 and not isinstance(element[0], str):
         return _mixed_space(domain, [function_space(domain, part).ufl_element() for part in element])
-    given = ("Lagrange", element) if _whole(element) else element
-    if not isinstance(given, (tuple, list)) or len(given) not in (2, 3) or not isinstance(given[0], str) or not _whole(given[1]):
+    given = ("Lagrange", element) if is_whole(element) else element
+    if (
+        not isinstance(given, (tuple, list))
+        or len(given) not in (2, 3)
+        or not isinstance(given[0], str)
+        or not is_whole(given[1])
+    ):
         raise InputError(f"element = {element!r}: expected a degree, (family, degree) or (family, degree, shape)")
     if not hasattr(domain, "topology"):
         raise InputError(f"domain = {domain!r}: expected a mesh, as that of read_gmsh")
     shape = given[2] if len(given) == 3 else shape
-    if not isinstance(shape, (tuple, list)) or not all(_whole(n) and n >= 1 for n in shape):
+    if not isinstance(shape, (tuple, list)) or not all(is_whole(n) and n >= 1 for n in shape):
         raise InputError(f"shape = {shape!r}: expected whole numbers, 1 or more, in brackets, as (2,)")
     try:
         if given[0] == "Quadrature":
@@ -145,10 +151,6 @@ def function_space(domain: Any, element: int | Sequence[Any], shape: Sequence[in
         return _space(domain, given[0], int(given[1]), tuple(shape))
     except Exception as error:  # of which class depends on the version of UFL
         raise InputError(f"element = {element!r} ({error}): expected a family and a degree of DOLFINx") from error
-
-
-def _whole(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 @kept()

@@ -19,7 +19,7 @@ from mpi4py import MPI
 import numpy as np
 import numpy.typing as npt
 
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, is_whole
 from uem_dolfinx.errors import InputError, InputTypeError
 
 W = TypeVar("W", bound=str)
@@ -151,7 +151,7 @@ def count(what: str, value: Any, remedy: str = "") -> int:
 def part_number(what: str, value: Any, of: str) -> int:
     """Number of a part of a mixed space, ``of`` in words; InputTypeError unless a whole number, InputError below 0."""
     expected = f"the number of the part of the mixed space that is {of}, counted from 0"
-    kind(what, value, isinstance(value, (int, np.integer)) and not isinstance(value, bool), expected)
+    kind(what, value, is_whole(value), expected)
     if value < 0:
         raise InputError(sentence(what, value, expected))
     return int(value)

@@ -259,9 +259,14 @@ class RigidCoupling(given.Sealed):
         self.reactions = sums[: self._sizes[0]], sums[self._sizes[0] :]
 
 
+def _composed(value: Any) -> bool:
+    """Whether a value is an expression of UFL, and more than a Constant."""
+    return isinstance(value, Expr) and not isinstance(value, fem.Constant)
+
+
 def _checked_motion(name: str, value: Any) -> Any:
     """A component of a motion, unchanged; an expression contains Constants and the place alone."""
-    if not isinstance(value, Expr) or isinstance(value, fem.Constant):
+    if not _composed(value):
         return checked_value(name, value, 1)
     parts = (one for one in traverse_unique_terminals(value) if not isinstance(one, (ConstantValue, MultiIndex)))
     if value.ufl_shape or any(not isinstance(one, (fem.Constant, ufl.SpatialCoordinate)) for one in parts):
@@ -271,7 +276,7 @@ def _checked_motion(name: str, value: Any) -> Any:
 
 def _number(value: Any, point: Array) -> Any:
     """The value of an expression at a point, and other values as they are."""
-    if not isinstance(value, Expr) or isinstance(value, fem.Constant):
+    if not _composed(value):
         return value
     constants = (one for one in traverse_unique_terminals(value) if isinstance(one, fem.Constant))
     return float(value(tuple(point), {one: one.value.item() if one.value.ndim == 0 else one.value for one in constants}))

@@ -15,7 +15,7 @@ from uem_dolfinx.geometry.decks import Deck
 
 #: A local direction is a global one if its other components are smaller.
 #: [bound; 1; -]
-ALONG = 1e-12
+NO_COMPONENT = 1e-12
 
 
 def node_of(deck: Deck, where: str) -> str:
@@ -148,7 +148,7 @@ class Closing:
         if dof > 3 or one not in self._axes:
             return np.eye(max(dof, 3))[dof - 1]
         axis = self._axes[one][dof - 1]
-        return np.where(np.abs(axis) > ALONG, axis, 0.0)
+        return np.where(np.abs(axis) > NO_COMPONENT, axis, 0.0)
 
     def _give(self, what: str, where: Where, history: list[Value | None]) -> None:
         for step, value in zip(self.model.steps, history):

@@ -17,7 +17,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, is_whole
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
@@ -287,8 +287,7 @@ def degree_of_displacement(W: Any, i: Any) -> int:
     if not compat.is_mixed(W):
         raise SpaceError("displacement names a part of a mixed space, and the space of u is none: leave displacement out")
     size = W.num_sub_spaces
-    whole = isinstance(i, (int, np.integer)) and not isinstance(i, bool)
-    given.kind("displacement", i, whole, f"the number of a part of the mixed space, one of 0 to {size - 1}")
+    given.kind("displacement", i, is_whole(i), f"the number of a part of the mixed space, one of 0 to {size - 1}")
     if not 0 <= i < size:
         raise InputError(given.sentence("displacement", i, f"the number of a part of the mixed space, one of 0 to {size - 1}"))
     part, g = W.sub(int(i)), W.mesh.geometry.dim

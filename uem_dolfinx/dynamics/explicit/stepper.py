@@ -239,9 +239,13 @@ class ExplicitStepper:
         control.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
         return condensed if stiff else fixed
 
+    def _differences(self, of: Array) -> Array:
+        """Differences of nodal values ``(n_local, gdim)`` along all edges ``(n, gdim)``."""
+        return np.asarray(of[self._edges[0]] - of[self._edges[1]])
+
     def _lengths(self, of: Array) -> Array:
-        """Lengths of the differences of nodal values ``(n_local, gdim)`` along all edges ``(n,)``."""
-        return np.asarray(np.linalg.norm(of[self._edges[0]] - of[self._edges[1]], axis=1))
+        """Lengths of these differences ``(n,)``."""
+        return np.asarray(np.linalg.norm(self._differences(of), axis=1))
 
     def look(self, stretch: float = np.inf) -> float:
         """Find how fast the velocities stretch edges of cells, and the shortest edge (collective).
@@ -283,10 +287,10 @@ class ExplicitStepper:
         config, dynamics = self.problem.config, self.dynamics
         if self.problem.bodies.linear or not np.isfinite(critical):
             return np.inf
-        along = config.x[self._edges[0]] - config.x[self._edges[1]]
+        along = self._differences(config.x)
         nodal = (of.x.array.reshape(-1, config.gdim) for of in (dynamics.velocity, dynamics.acceleration))
         # turning does not stretch
-        v, a = (((of[self._edges[0]] - of[self._edges[1]]) * along).sum(axis=1) for of in nodal)
+        v, a = ((self._differences(of) * along).sum(axis=1) for of in nodal)
         rates = np.hypot(v, 0.5 * critical * a) / (along**2).sum(axis=1)
         fastest = float(reduced(self.problem.comm, float(rates.max(initial=0.0)), op=MPI.MAX))
         return STEADY_STRAIN / fastest if fastest > 0.0 else np.inf

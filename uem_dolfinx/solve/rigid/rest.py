@@ -94,15 +94,14 @@ def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any, sy
     """
     converge = partial(problem.converge, problem.bodies, system, start, fraction, along)
     try:
-        history: list[Any] | None = converge()
+        history: list[Any] = converge()
     except (ConvergenceError, FloatingBodyError) as error:
         problem.watch.advise(error)
-        history = _rest(problem, converge) if along is None and _may_rest(problem) else None
-        if history is None:
+        rested = _rest(problem, converge) if along is None and _may_rest(problem) else None
+        if rested is None:
             raise error
-    assert history is not None
-    wear = along is None and wear_on(problem.interfaces)
-    return [*history, *converge()] if wear else history
+        history = rested
+    return [*history, *converge()] if along is None and wear_on(problem.interfaces) else history
 
 
 def _may_rest(problem: Any) -> bool:
