@@ -210,11 +210,6 @@ def is_mixed(V: Any) -> bool:
     return bool(V.num_sub_spaces > 1 and V.dofmap.index_map_bs == 1)
 
 
-def is_part(V: Any) -> bool:
-    """Whether a space is a part of a mixed one, and not a component of a vector space or of such a part."""
-    return len(V.component()) == 1 and V.dofmap.index_map_bs == 1
-
-
 def part_dofs(V: Any, i: int) -> npt.NDArray[np.int32]:
     """Local d.o.f. of a mixed space that its part i has in every cell ``(n_cells incl. ghosts, n)``, components next to each other."""
     cells, part = V.mesh.topology.index_map(V.mesh.topology.dim), V.sub(i).dofmap

@@ -32,12 +32,12 @@ def dirichlet(
         uem.dirichlet(V, tags["edge"], 1, lambda x, t: 0.1 * t * np.sin(np.pi * x[0]))
 
     Args:
-        V: a Lagrange space with ``size`` components, or a part of a mixed space, e.g. ``W.sub(0)``.
+        V: a Lagrange space with ``size`` components, a part of a mixed space, e.g. ``W.sub(0)``, or a component of either.
         tag: facets, or entities of any dimension: a tag, a list of tags, ``(meshtags, value)``, or facet indices.
         component: 0 is x; None prescribes all components.
         value: a number, or for all components a vector ``(size,)``; or a Constant of one of these shapes, or a Function of ``V``
-            (for one component of a scalar space of the same degree), both of which may be changed between steps. A vector part of a
-            mixed space needs one condition per component. Or a function of positions x ``(3, n)``, as in DOLFINx's ``interpolate``,
+            (for one component of a scalar space, for a vector part of a mixed space of a vector space, of the same degree), both of which
+            may be changed between steps. Or a function of positions x ``(3, n)``, as in DOLFINx's ``interpolate``,
             which returns ``(n,)``, or for all components ``(size, n)``; with a second argument it is a function of the load factor
             or time, which needs no ``load`` and is not ramped. Or a UFL expression, such as the component ``w[1]`` of a Function, which
             is evaluated in every step.
@@ -56,10 +56,16 @@ def dirichlet(
         value = _checked(V, component, value)
     tdim = mesh.topology.dim
     tag = as_tag(tag, mesh, (tdim - 1, *range(tdim + 1)), "the support")
-    part = compat.is_part(V)
+    part = bool(len(V.component()))
     sub = V if component is None or V.num_sub_spaces < 2 else V.sub(int(component))
-    if not isinstance(value, (fem.Function, fem.Constant)) and (isinstance(value, Expr) or callable(value)):
+    # DOLFINx takes no vectors of numbers for a part
+    vectors = sub is V and part and V.num_sub_spaces > 1
+    constant = isinstance(value, fem.Constant) and not vectors
+    if not isinstance(value, fem.Function) and not constant and (isinstance(value, Expr) or callable(value)):
         return _by_rule(V, tag, component, value, sub is V and not part)
+    if vectors and not isinstance(value, fem.Function):
+        values, value = value, fem.Function(_values_space(V, True))
+        value.x.array.reshape(-1, len(values))[:] = values
     if not isinstance(value, fem.Function):
         return compat.dirichletbc(value, locate_dofs(sub, tag), sub)
     if sub is V and not part:
@@ -71,27 +77,25 @@ def _by_rule(V: Any, tag: Tag, component: int | None, value: Any, whole: bool) -
     """A condition whose values follow a function or an expression (collective)."""
     from uem_dolfinx.conditions.prescribed import Rule
 
-    values = fem.Function(V if whole else compat.function_space(V.mesh, compat.highest_degree(V)))
+    values = fem.Function(V if whole else _values_space(V, component is None))
     bc = dirichlet(V, tag, component, values)
     bc.rule = Rule(value, values, locate_dofs(values.function_space, tag), str(tag.name))
     bc.rule.take_load(V.mesh.comm, 0.0)
     return bc
 
 
+def _values_space(V: Any, whole: bool) -> Any:
+    """Lagrange space of the degree of a part of a mixed space: of vectors if it has components and they are prescribed as a whole."""
+    shape = (V.num_sub_spaces,) if whole and V.num_sub_spaces > 1 else ()
+    return compat.function_space(V.mesh, compat.highest_degree(V), shape)
+
+
 def _checked(V: Any, component: int | None, value: Any) -> Any:
     """The value for ``fem.dirichletbc``, checked to be finite and to fit the space."""
-    part, degree = compat.is_part(V), compat.lagrange_degree(V)
+    part, degree = bool(len(V.component())), compat.lagrange_degree(V)
     size = max(V.num_sub_spaces, 1) if part else V.dofmap.index_map_bs
-    if degree is None or not (part or (V.dofmap.bs == size and not len(V.component()))):
-        raise SpaceError(
-            "V is no whole Lagrange space: expected that of the displacement, or a part of a mixed one as W.sub(0); name a component "
-            "of it by the argument component"
-        )
-    if part and size > 1 and component is None:
-        raise InputError(
-            f"component is None: expected one of 0 to {size - 1} for a part of a mixed space; make a condition for each, as "
-            f"[uem.dirichlet(V, tag, i) for i in range({size})]"
-        )
+    if degree is None or not (part or V.dofmap.bs == size):
+        raise SpaceError("V is no Lagrange space: expected that of the displacement, a part of a mixed one as W.sub(0), or a component")
     if component is not None and (given.truth(component) or component not in range(size)):
         raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
     n = size if component is None else 1
@@ -108,9 +112,10 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
         return value
     if isinstance(value, fem.Function):
         own, array = value.function_space, value.x.array
-        scalar = own.dofmap.index_map_bs == 1 and compat.lagrange_degree(own) == degree and own.mesh is V.mesh
-        if not (own == V if n == size and not part else scalar):
-            wanted = "the condition's space" if n == size else f"a scalar Lagrange space of degree {degree} on its mesh"
+        alike = own.dofmap.index_map_bs == n and compat.lagrange_degree(own) == degree and own.mesh is V.mesh
+        if not (own == V if n == size and not part else alike):
+            space = f"a {'scalar' if n == 1 else 'vector'} Lagrange space of degree {degree} on its mesh"
+            wanted = "the condition's space" if n == size and not part else space
             raise SpaceError(f"the value '{value.name}' of a Dirichlet condition is no Function of {wanted}")
     else:
         try:

@@ -117,21 +117,46 @@ def test_an_expression_follows_constants_and_fields():
 
 
 def test_in_a_mixed_space():
-    """Parts of a mixed space, vectors and scalars."""
-    s, _, (left, _, _, top) = square()
+    """Parts of a mixed space, vectors and scalars, and components: by numbers, Constants, functions, fields and expressions alike."""
+    s, V, (_, _, _, top) = square()
     W = compat.function_space(s.mesh, [("Lagrange", 2, (2,)), 1])
-    w = fem.Function(W)
-    for bc, part in (
-        (uem.dirichlet(W.sub(0), left, 1, lambda x: x[1] ** 2), lambda x: x[1] ** 2),
-        (uem.dirichlet(W.sub(1), top, None, lambda x, s: (1 + s) * x[0]), lambda x: x[0]),
-    ):
-        w.x.array[:] = np.nan
+    c, X = fem.Constant(s.mesh, np.array([0.5, 2.0])), ufl.SpatialCoordinate(s.mesh)
+    linear_in_x = fem.Function(compat.function_space(s.mesh, 2, (2,)))
+    linear_in_x.interpolate(lambda x: np.vstack([x[0], 2.0 + x[0]]))
+
+    def by_place(x, s=0.0):
+        return np.vstack([x[0], 2.0 + x[0]])
+
+    vectors = [linear_in_x, by_place, lambda x, s: by_place(x), ufl.as_vector([X[0], 2.0 + X[0]])]
+    scalars = (c[0], linear_in_x[0] - X[0] + 0.5, lambda x: 0.5 + 0.0 * x[0], 0.5, fem.Constant(s.mesh, 0.5))
+    parts = [(W, W.sub(0), value, {0: 0.5, 1: 2.5}) for value in vectors] + [
+        (W, W.sub(0), value, {0: 0.5, 1: 2.0}) for value in (c, (0.5, 2.0))
+    ]
+    for space, part, i in ((W, W.sub(0).sub(1), 1), (W, W.sub(1), 2), (V, V.sub(1), 1)):
+        parts += [(space, part, value, {i: 0.5}) for value in scalars]
+    for space, part, value, means in parts:
+        w, bc = fem.Function(space), uem.dirichlet(part, top, None, value)
         compat.set_bc_values(w.x.array, [bc])
-        known = np.isfinite(w.x.array)
-        assert COMM.allreduce(int(known.sum())) > 0
-        x = fem.Function(bc.rule.values.function_space)
-        x.interpolate(part)
-        assert set(np.round(w.x.array[known], 12)) <= set(np.round(x.x.array, 12))
+        for i, mean in means.items():
+            assert uem.integrate(w[i] * uem.ds(top)) == pytest.approx(mean, rel=1e-12)
+
+
+def test_a_body_of_two_fields_is_led_as_one_of_one():
+    """All components of the displacement by one condition, in load steps: the displacement of the same body without a second field."""
+    s, V, (left, right, _, _) = square()
+    W, found = compat.function_space(s.mesh, [("Lagrange", 1, (2,)), 1]), []
+    way = fem.Constant(s.mesh, np.array([0.01, 0.02]))
+    for space in (V, W):
+        w = fem.Function(space)
+        u, part = (w, space) if space is V else (ufl.split(w)[0], space.sub(0))
+        v = ufl.TestFunction(space) if space is V else ufl.TestFunctions(space)[0]
+        F = uem.NeoHooke(100.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+        if space is W:
+            F += ufl.split(w)[1] * ufl.TestFunctions(space)[1] * ufl.dx
+        bcs = [uem.dirichlet(part, left), uem.dirichlet(part, right, None, way)]
+        problem = uem.UnitedProblem(F, w, bcs=bcs, rtol=1e-12, displacement=None if space is V else 0)
+        found.append([uem.integrate(ufl.inner(u, u) * ufl.dx) for _ in uem.load_steps(problem, 2)])
+    np.testing.assert_allclose(*found, rtol=1e-9)
 
 
 @pytest.mark.parametrize("mass", [uem.lumped_mass, uem.consistent_mass])

@@ -184,8 +184,6 @@ def test_true_is_no_number():
     refused(uem.InputError, "component = True", lambda: uem.dirichlet(V, b.bottom, True))
     refused(uem.MassError, "density True", lambda: uem.lumped_mass(V, True))
     refused(uem.InputError, "adjust = inf", lambda: uem.Contact(high, low, adjust=np.inf))
-    W = uem.function_space(b.scene.mesh, [("Lagrange", 2, (2,)), 1])
-    refused(uem.InputError, "[uem.dirichlet(V, tag, i) for i in range(2)]", lambda: uem.dirichlet(W.sub(0), b.bottom))
 
 
 # -- surfaces ----------------------------------------------------------------------------------------------------------

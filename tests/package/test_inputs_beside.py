@@ -192,9 +192,11 @@ def mixed_space(mesh):
 def test_a_part_of_a_mixed_space():
     b = blocks(COMM, "triangle", 2, 2)
     W = mixed_space(b.scene.mesh)
-    for V in (W, W.sub(0).sub(1)):
-        refused(uem.SpaceError, ("whole Lagrange space", "mixed"), lambda V=V: uem.dirichlet(V, b.bottom))
-    refused(uem.InputError, ("component is None", "a condition for each"), lambda: uem.dirichlet(W.sub(0), b.bottom))
+    refused(uem.SpaceError, ("no Lagrange space", "mixed"), lambda: uem.dirichlet(W, b.bottom))
+    refused(uem.InputError, "a value of the shape (3,)", lambda: uem.dirichlet(W.sub(0), b.bottom, None, np.ones(3)))
+    refused(uem.InputError, "one of 0 to 0", lambda: uem.dirichlet(W.sub(0).sub(1), b.bottom, 1))
+    other = fem.Function(uem.function_space(b.scene.mesh, ("Lagrange", 2, (2,))))
+    refused(uem.SpaceError, "a vector Lagrange space of degree 1", lambda: uem.dirichlet(W.sub(0), b.bottom, None, other))
     refused(uem.SpaceError, ("V is a part",), lambda: uem.lumped_mass(W.sub(0), 1.0))
 
 
