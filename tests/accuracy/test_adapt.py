@@ -56,6 +56,26 @@ def test_sizes_for_a_tolerance(degree, quads):
     assert 0.75 * tolerance < found.estimate.relative <= tolerance
 
 
+def pressed(size):
+    """A quarter disc on a block, whose first cells are eight times as wide as half of the contact."""
+    mesh, tags = uem.read_gmsh(uem.example_mesh("adapt_hertz"), COMM, gdim=2, parameters={"order": 2}, size=size)
+    V = uem.function_space(mesh, 2, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["block_bottom"], 1)]
+    bcs += [uem.dirichlet(V, tags["disc_top"], 1, -0.006)]
+    contact = uem.Contact(tags["disc_arc"], tags["block_top"], coupling="mortar", sliding="fixed")
+    return uem.UnitedProblem(
+        uem.LinearElastic(1e6, 0.3, kind="plane_strain").residual(u, v) * ufl.dx, u, bcs=bcs, contacts=[contact]
+    )
+
+
+def test_a_contact_narrower_than_the_cells():
+    """The second mesh improves little, since one node touches: the next ones are not finer than the tolerance needs."""
+    found = uem.adapt(pressed, tolerance=0.02)
+    assert found.meshes[1].estimate > 0.85 * found.meshes[0].estimate
+    assert found.reached and found.estimate.relative > 0.5 * 0.02 and found.meshes[-1].cells < 3 * found.meshes[0].cells
+
+
 @pytest.mark.parametrize("quads, h, tolerance", [(0, 0.1, 0.035), slow(1, 0.2, 0.03)])
 def test_fewer_cells_than_at_first(quads, h, tolerance):
     """Of a fine uniform mesh most cells are merged, with a smaller error than before: fine cells far from the corner serve nothing."""
