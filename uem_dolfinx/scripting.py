@@ -95,7 +95,9 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
     part, degree = bool(len(V.component())), compat.lagrange_degree(V)
     size = max(V.num_sub_spaces, 1) if part else V.dofmap.index_map_bs
     if degree is None or not (part or V.dofmap.bs == size):
-        raise SpaceError("V is no Lagrange space: expected that of the displacement, a part of a mixed one as W.sub(0), or a component")
+        raise SpaceError(
+            "V is no Lagrange space: expected that of the displacement, a part of a mixed one as W.sub(0), or a component"
+        )
     if component is not None and (given.truth(component) or component not in range(size)):
         raise InputError(given.sentence("component", component, f"one of 0 to {size - 1}, or None for all"))
     n = size if component is None else 1

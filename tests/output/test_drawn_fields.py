@@ -6,6 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from dolfinx import fem
 from helpers import blocks, linear, refused
 
 import uem_dolfinx as uem
@@ -62,3 +63,34 @@ def test_sections_are_seen(side):
     view = Drawing(problem, view=None, **usual).view
     np.testing.assert_allclose(view, np.array([1.0, side, 1.0]) / np.sqrt(3.0))
     np.testing.assert_allclose(Drawing(problem, view=(0.0, 0.0, 2.0), **usual).view, [0.0, 0.0, 1.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis, side", [(0, 1.0), (1, -1.0), (2, 1.0)])
+def test_the_colour_of_a_section(axis, side):
+    """A field that is largest on the face that the window cuts: a quarter of the picture has its colour, and nothing from behind."""
+    pytest.importorskip("pyvista")
+    from ctypes.util import find_library
+    from io import BytesIO
+
+    if not any(map(find_library, ("EGL", "OSMesa"))):
+        pytest.skip("nothing to draw with")
+    problem, _ = pressed("hexahedron")
+    place = fem.Function(uem.function_space(problem.config.mesh, 1))
+    place.interpolate(lambda x: side * x[axis])
+    window, shares = np.array([[-9.0, 9.0]] * 3), []
+    window[axis, 1 if side > 0 else 0] = 0.3
+    for view in (None, -side * np.eye(3)[axis] - 0.1):
+        picture = uem.plot_scene(problem, field=place, window=window.ravel(), view=view, scale=0.0, levels=8, dpi=80)
+        if COMM.rank == 0:
+            from matplotlib.image import imread
+
+            image = imread(BytesIO(picture._repr_png_()))[..., :3]
+            # without the colour bar
+            image = image[:, : int(0.7 * image.shape[1])]
+            body = (np.ptp(image, axis=2) > 0.1).sum()
+            # yellow, in any light; lower values are green and blue
+            red, green, blue = np.moveaxis(image, 2, 0)
+            shares.append(((red > 0.9 * green) & (blue < 0.5 * red)).sum() / body)
+    if COMM.rank == 0:
+        assert shares[0] > 0.25 and shares[1] < 0.1, shares

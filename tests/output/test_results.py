@@ -150,6 +150,33 @@ def test_files_for_paraview(folder: Path, cell: str, degree: int) -> None:
         assert (folder / "out" / f"blocks_{kind}.bp").exists() == compat.has_vtx()
 
 
+@pytest.mark.skipif(not compat.has_vtx(), reason="this DOLFINx has no ADIOS2")
+@pytest.mark.parametrize("degree", [1, 2])
+def test_vtx_has_the_numbers_of_every_step(folder: Path, degree: int) -> None:
+    """Values at all nodes of the displacement's degree, by the names and at the times of XDMF, on any ranks."""
+    adios2 = pytest.importorskip("adios2")
+    problem = pressed("triangle", degree)
+    with uem.ResultsWriter(folder / "blocks", problem, vtx=True) as writer:
+        ends = [(writer.write(step), helpers.highest(comm, np.abs(problem.u.x.array)))[1] for step in uem.load_steps(problem, 2)]
+    comm.barrier()
+    if comm.rank:
+        return
+    for kind, name, n in (("vectors", "displacement", 3), ("scalars", "contact_pressure", 1)):
+        with adios2.Stream(str(folder / f"blocks_{kind}.bp"), "r") as stream:
+            read = []
+            for _ in stream.steps():
+                blocks = stream.all_blocks_info(name)[0]
+                read.append(
+                    (float(stream.read("step")), np.concatenate([stream.read(name, block_id=k) for k in range(len(blocks))]))
+                )
+        assert [time for time, _ in read] == [0.5, 1.0]
+        assert all(values.shape[1:] in ((n,), ()) for _, values in read)
+        if kind == "vectors":
+            assert [np.abs(values).max() for _, values in read] == pytest.approx(ends, rel=1e-12)
+        else:
+            assert read[1][1].max() == pytest.approx(2 * read[0][1].max(), rel=1e-9) and read[0][1].max() > 0
+
+
 @pytest.mark.skipif(compat.has_vtx(), reason="this DOLFINx has ADIOS2")
 def test_vtx_where_there_is_none_is_a_named_error(folder: Path) -> None:
     with pytest.raises(uem.MissingBackendError, match="ADIOS2"):

@@ -151,7 +151,7 @@ class Drawn(ABC):
             self.box = self.box + np.minimum(0.06 * sides.max(), 0.25 * sides) * np.array([-1.0, 1.0])
         # sides of bodies at the limits of the window are visible, in spite of rounding
         self.box = self.box + EVEN * np.diff(self.box, axis=1) * np.array([-1.0, 1.0])
-        seen = np.concatenate([f.values[self._visible(f.x)] for f in frames])
+        seen = np.concatenate([self._seen(f) for f in frames])
         if not len(seen):
             seen = np.concatenate([f.values for f in frames])
         least, most = float(seen.min()), float(seen.max())
@@ -180,9 +180,10 @@ class Drawn(ABC):
         """Mask of points in the window."""
         return np.asarray(((x >= self.box[:, 0]) & (x <= self.box[:, 1])).all(axis=1))
 
-    def _visible(self, x: Array) -> Array:
-        """Mask of vertices whose values have colours in the window."""
-        return self._shown(x)
+    def _seen(self, frame: Frame) -> Array:
+        """Values with colours in the window ``(n,)``, of vertices and of sections."""
+        corners = frame.cuts[0].reshape(-1, 3)[:, : len(self.box)]
+        return np.concatenate([frame.values[self._shown(frame.x)], frame.cuts[1].ravel()[self._shown(corners)]])
 
     def _arrows(self, frame: Frame) -> tuple[Array, Array]:
         """Contact forces per tributary area: positions and arrows ``(n, gdim)``; the longest is an eighth of the picture."""
@@ -238,14 +239,14 @@ class Drawn2D(Drawn):
     def _shown(self, x: Array) -> Array:
         return np.any([super(Drawn2D, self)._shown(x * [side, 1.0]) for side in self.sides], axis=0)
 
-    def _visible(self, x: Array) -> Array:
+    def _seen(self, frame: Frame) -> Array:
         # also of cells that reach into the window with none of their vertices
-        seen = self._shown(x)
+        seen = self._shown(frame.x)
         for side in self.sides:
-            corners = (x * [side, 1.0])[self.pieces.faces]
+            corners = (frame.x * [side, 1.0])[self.pieces.faces]
             inside = (corners.max(axis=1) >= self.box[:, 0]) & (corners.min(axis=1) <= self.box[:, 1])
             seen[self.pieces.faces[inside.all(axis=1)]] = True
-        return seen
+        return np.asarray(frame.values[seen])
 
     def draw(self, ax: Any, frame: Frame) -> None:
         """Draw a frame into a panel."""

@@ -264,8 +264,12 @@ class ResultsWriter(Closing, given.Sealed):
     def _open_vtx(self) -> list[Any]:
         """New VTX files, with names that are not in use (collective)."""
         opened, comm, degree = [], self.problem.comm, self.problem.config.degree
-        # a file holds Functions of one element
-        alike = [u for u in self._sources().values() if compat.lagrange_degree(u.function_space) == degree]
+        # a file holds Functions of one element; their names are those in XDMF
+        alike = [
+            fem.Function(u.function_space, u.x, name=name)
+            for name, u in self._sources().items()
+            if compat.lagrange_degree(u.function_space) == degree
+        ]
         for rank, ending in enumerate(ENDINGS):
             functions = [u for u in alike if len(u.ufl_shape) == rank]
             if self._wants_vtx and functions:
