@@ -12,7 +12,7 @@ import pytest
 import ufl
 from body_scenes import fork
 from dolfinx import fem
-from helpers import M, arch, at, blocks, box, clamp, highest, linear, refused, run, scene, slow, st_venant
+from helpers import NU, M, arch, at, blocks, box, clamp, highest, linear, refused, run, scene, slow, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -307,11 +307,25 @@ def test_what_is_refused():
     refused(uem.InputError, "CentralDifferences", lambda: problem(soft_one, dynamics=explicit))
 
 
-@pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron")])
-def test_the_tangent_is_the_derivative(cell):
-    """On arched surfaces ``K + sum k r r' - sum lambda grad^2 g`` is the derivative of the forces by their present gaps."""
-    b = blocks(COMM, cell, 3, 4, pose=arch(0.2), gap=-0.02)
-    contact = uem.Contact(b.high, b.low, normal=uem.SoftContact(ROUGH))
+@pytest.mark.parametrize("cell, coupling, target, overhang", [
+    ("triangle", "node_to_surface", "mesh", 0.25),
+    ("triangle", "mortar", "mesh", 0.25),
+    ("triangle", "mortar", "mesh", 0.0),
+    slow("triangle", "mortar", "ball", 0.25),
+    slow("quadrilateral", "mortar", "mesh", 0.25),
+    slow("tetrahedron", "node_to_surface", "mesh", 0.25),
+    slow("tetrahedron", "mortar", "mesh", 0.25),
+    slow("tetrahedron", "mortar", "ball", 0.25),
+])  # fmt: skip
+def test_the_tangent_is_the_derivative(cell, coupling, target, overhang):
+    """On arched surfaces forces are those of the energy in the gaps, and ``K + sum k r r' - sum lambda grad^2 g`` is their derivative.
+
+    Without overhang facets of the contactor are covered in part. Gaps are far from closed.
+    """
+    law = uem.Exponential(2e-3, 5e-2)
+    b = blocks(COMM, cell, 3, 4, pose=arch(0.2), gap=-0.02, overhang=overhang)
+    ball = uem.RigidSphere([0.4] * (b.gdim - 1) + [-2.0], 2.0)
+    contact = uem.Contact(b.high, b.low if target == "mesh" else ball, normal=uem.SoftContact(law), coupling=coupling)
     problem = uem.UnitedProblem(st_venant(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
     system, pair, config = problem.system, contact.pair, problem.config
     x = config.X
@@ -324,19 +338,57 @@ def test_the_tangent_is_the_derivative(cell):
         problem.bodies.assemble()
         return system.residual()
 
+    def total(values) -> float:
+        return COMM.allreduce(float(np.sum(values)))
+
     assert highest(COMM, np.abs(residual(smooth).array_r)) > 0 and COMM.allreduce(int((pair.trial.lam > 0).sum())) > 2
-    facets = pair.kinematics.projection.facet.copy()
+    area, n = contact.measured_areas(), config.n_owned
+    force = total(config.add_at_owners(*pair.applied_forces()) * direction[:n])
     K = problem.bodies.update_tangent().copy()
     nodes, blocks_of_gaps, left = pair.slip_terms()
     assert highest(COMM, np.abs(left)) < 1e-12
     of_gaps = contact_curvature([(nodes, blocks_of_gaps)], config.vector())
     bends = curvature_of([pair], config.vector(), True, False)
     du = K.createVecRight()
-    du.array[:] = direction[: config.n_owned].ravel()
-    wanted = K * du + of_gaps * du + bends * du
+    du.array[:] = direction[:n].ravel()
+    of_contact = of_gaps * du + bends * du
     h = 1e-6
-    found = residual(smooth + h * direction) - residual(smooth - h * direction)
-    assert highest(COMM, np.abs(pair.kinematics.projection.facet - facets)) == 0
-    found.scale(0.5 / h)
-    assert (found - wanted).norm() < 1e-6 * wanted.norm()
-    assert (bends * du).norm() > 1e-4 * wanted.norm() and (of_gaps * du).norm() > 1e-2 * wanted.norm()
+    sides = []
+    for side in (h, -h):
+        found = residual(smooth + side * direction)
+        sides.append((found, total(area * law.p0 * law.h * np.exp(-pair.gaps() / law.h))))
+    (ahead, more), (behind, less) = sides
+    assert (more - less) / (2 * h) == pytest.approx(-force, rel=1e-7)
+    found = (ahead - behind) * (0.5 / h) - K * du
+    assert (found - of_contact).norm() < 1e-5 * of_contact.norm()
+    assert (bends * du).norm() > 1e-2 * of_contact.norm() and (of_gaps * du).norm() > 1e-2 * of_contact.norm()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [1, 2])
+def test_what_a_slide_stores(degree):
+    """Without friction the work of a block that slides over an arch by mortar is stored in the bodies and in the gaps."""
+    law, travel, press = uem.Exponential(2e-3, 2e-2), 0.5, 0.03
+
+    def slid(steps):
+        b = blocks(COMM, "quadrilateral", 6, 3, pose=arch(0.2), degree=degree, overhang=0.75)
+        contact = uem.Contact(b.high, b.low, normal=uem.SoftContact(law), coupling="mortar")
+        down = uem.dirichlet(
+            b.V, b.top, value=lambda x, s: np.stack([travel * s + 0 * x[0], -press * min(1.0, 2 * s) + 0 * x[0]])
+        )
+        problem = uem.UnitedProblem(st_venant(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), down], contacts=[contact])
+        E = 0.5 * (ufl.grad(b.u).T * ufl.grad(b.u) + ufl.grad(b.u) + ufl.grad(b.u).T)
+        shear = 0.5 / (1 + NU)
+        stored = 0.5 * (M - 2 * shear) * ufl.tr(E) ** 2 + shear * ufl.inner(E, E)
+        forces, energies = [], []
+        for step in uem.load_steps(problem, 2 * steps):
+            assert step.newton_iterations <= 6
+            in_gaps = float((contact.measured_areas() * law.p0 * law.h * np.exp(-contact.pair.gaps() / law.h)).sum())
+            forces.append(contact.resultant().force[0])
+            energies.append(uem.integrate(stored * ufl.dx) + COMM.allreduce(in_gaps))
+        pull = np.array(forces[steps - 1 :])
+        return -travel * np.sum(pull[1:] + pull[:-1]) / (4 * steps), energies[-1] - energies[steps - 1]
+
+    (coarse, _), (fine, gained) = slid(4), slid(8)
+    # Simpson's rule
+    assert (4 * fine - coarse) / 3 == pytest.approx(gained, rel=5e-3)

@@ -386,7 +386,8 @@ class Contact(WatchedContact, given.Sealed):
             warn_of_slim_tips(config, self.name, surface)
             tied = (self.tied or getattr(self.cohesion, "bonds", False)) and target.n_nodes
             means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"})) if tied else None
-            return Mortar(config, nodes, target, surface=surface, **how), means
+            law = self.normal is not None or (self.cohesion is not None and not self.cohesion.bonds)
+            return Mortar(config, nodes, target, surface=surface, of_gaps=law, **how), means
         from uem_dolfinx.contact.nodes.bernstein import Bernstein
         from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 

@@ -9,8 +9,10 @@ from ufl.core.expr import Expr
 
 from uem_dolfinx.conditions.equation import Equation, Periodic
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.mortar.placement import MortarKinematics
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.overlaps import SLIVER
 from uem_dolfinx.gradients.parameters import ContactParameter
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -62,14 +64,14 @@ def refuse_soft(contact: Contact) -> None:
         (contact.normal.damping, "damping", "no damping"),
         (contact.measure == "current", "measure='current', whose areas change", "measure='reference'"),
         (
-            contact.coupling == "mortar" and contact.sliding == "finite",
-            "coupling='mortar' and sliding='finite', whose areas change",
-            "sliding='small' or 'fixed', or coupling='node_to_surface'",
+            contact.coupling == "mortar" and contact.sliding == "finite" and contact.config.degree == 2,
+            "coupling='mortar', sliding='finite' and degree 2, whose areas change",
+            "degree 1, sliding='small' or 'fixed', or coupling='node_to_surface'",
         ),
         (
-            contact.coupling == "mortar" and hasattr(contact.target, "project"),
-            "coupling='mortar' and a rigid target",
-            "coupling='node_to_surface'",
+            contact.coupling == "mortar" and contact.sliding != "finite" and hasattr(contact.target, "project"),
+            f"coupling='mortar', sliding='{contact.sliding}' and a rigid target",
+            "sliding='finite', or coupling='node_to_surface'",
         ),
     ):
         if there:
@@ -77,10 +79,20 @@ def refuse_soft(contact: Contact) -> None:
 
 
 def refuse_sharp(contact: Contact) -> None:
-    """Refuse a soft contact by nodes that presses at sharp edges, where areas turn with the target's normal (collective)."""
-    if contact.normal is None or contact.coupling == "mortar":
+    """Refuse a soft contact whose areas change where it presses: nodes at sharp edges, mortar's facets covered in part (collective)."""
+    if contact.normal is None:
         return
-    pressing = (contact.pair.trial.lam > 0.0) & contact.surface.at_sharp_edges(contact.nodes)
+    pressing = contact.pair.trial.lam > 0.0
+    if contact.coupling == "mortar":
+        assert isinstance(contact.pair.kinematics, MortarKinematics)
+        partly = pressing & (contact.pair.kinematics.rows.ratio < 1.0 - SLIVER)
+        if contact.sliding == "finite" and reduced(contact.config.comm, int(partly.sum())):
+            raise InputError(
+                f"contact '{contact.name}': facets that press are covered in part, where areas of soft contact have no derivatives: "
+                "make the contactor the smaller surface, or take sliding='small'"
+            )
+        return
+    pressing &= contact.surface.at_sharp_edges(contact.nodes)
     if reduced(contact.config.comm, int(pressing.sum())):
         raise InputError(
             f"contact '{contact.name}': nodes at sharp edges of the contactor press, and areas of soft contact there have no derivatives: "

@@ -197,7 +197,7 @@ class MortarContact(BodiesContact):
         from uem_dolfinx.contact.general.mortar import AmongBodiesMortar
 
         surface = TargetFacets(self.config, self.contactor, "contactor")
-        return AmongBodiesMortar(self.config, nodes, target, surface=surface, **how), None
+        return AmongBodiesMortar(self.config, nodes, target, surface=surface, of_gaps=self.normal is not None, **how), None
 
     def edges_that_meet(self) -> Meeting:
         """Sharp edges of all bodies, without self-contact."""

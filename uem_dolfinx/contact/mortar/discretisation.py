@@ -49,15 +49,22 @@ GOES_ON_COVERING = 0.7
 
 
 class Mortar(Contactors):
-    """Implements ``Discretisation``: contactor facets against the surface of one target; arguments as those of ``Contactors``."""
+    """Implements ``Discretisation``: contactor facets against the surface of one target; other arguments as those of ``Contactors``.
+
+    Args:
+        of_gaps: whether a law gives forces across open gaps. Rows are then derivatives of mean gaps, times their areas.
+    """
 
     traits = Traits(at_feet=False, pointwise=False, chained=True, two_pass=False)
 
     #: Whether the last rows were made before any facets had faced each other in the step.
     _afresh = False
 
-    def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
+    def __init__(
+        self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, of_gaps: bool = False, **how: Any
+    ):  # fmt: skip
         super().__init__(config, nodes, target, surface=surface, **how)
+        self.of_gaps = of_gaps
         # distinguishes equal nodes, independent of the partition
         nn = surface.dofs.shape[1]
         code = (surface.keys[:, None] * nn + np.arange(nn)) * 2654435761 % 2**32 / 2**32
@@ -174,8 +181,8 @@ class Mortar(Contactors):
             return self._gather(at, facets, ratio[self.nodes], stretch, nearest)
 
         rows = less(offsets := self._offsets(facets))
-        if self.sliding != "finite":
-            # kept areas do not grow: the derivatives are those of gaps that are closed in the mean
+        if self.of_gaps or self.sliding != "finite":
+            # areas do not grow with gaps: the derivatives are those of gaps that are closed in the mean
             heights = config.from_owners(self.nodes, self.heights(rows)[:, None], dofs.ravel()).reshape(dofs.shape)
             rows = less(heights if offsets is None else heights + offsets).at_gaps(rows.plain.gap)
         return replace(rows, facing=facing)
@@ -291,9 +298,9 @@ class Mortar(Contactors):
         sharing, same = self.elimination.seam.sharing, self.elimination.seam.same(own)
         itself = np.einsum("mij,mij->mi", coefficients, same)
         f, i = np.nonzero(area > 0)
-        values = np.column_stack([itself[f, i, None] * normal[f], gap[f, i], area[f, i, None] * normal[f]])
-        total = self.elimination.total(own[f, i], values)
-        direction, gap, size = total[:, : config.gdim], total[:, config.gdim], np.linalg.norm(total[:, config.gdim + 1 :], axis=1)
+        values = np.column_stack([itself[f, i, None] * normal[f], gap[f, i], area[f, i], area[f, i, None] * normal[f]])
+        direction, gap, size, vector = np.split(self.elimination.total(own[f, i], values), np.cumsum([config.gdim, 1, 1]), axis=1)
+        gap, size = gap[:, 0], size[:, 0] if self.of_gaps else np.linalg.norm(vector, axis=1)
         length = np.linalg.norm(direction, axis=1)
         is_covered = length > 0
         scale = np.where(is_covered, length, 1.0)

@@ -176,6 +176,13 @@ class Duals:
         here = np.einsum("qb,qbc->qc", b, (self.A.transpose(0, 2, 1) @ more)[facet])
         return fore[facet] + here, b[:, :, None] * (more[facet] - here[:, None])
 
+    def added(self, facet: Ints, values: Array) -> Array:
+        """Sums ``(q, nn, ...)`` of ``values`` for the functions b of facets ``(q,)`` with those that are added to the foremost one."""
+        own = self.own[facet].reshape(*values.shape[:2], *(1,) * (values.ndim - 2))
+        out = np.where(own, values, 0.0)
+        out[np.arange(len(facet)), self.foremost[facet]] += np.where(own, 0.0, values).sum(axis=1)
+        return out
+
     def at_end(self, facet: Ints, b: Array, gap: Array) -> Array:
         """Derivative of weighted gaps by the covered part, at points of its boundary.
 

@@ -35,7 +35,10 @@ class Contactors(OnTarget):
 
     Attributes:
         faced: keys, independent of the partition, of contactor and target facets that have faced each other in this step ``(p, 2)``.
+        of_gaps: whether a law gives forces across open gaps.
     """
+
+    of_gaps: bool = False
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -187,6 +190,8 @@ class MortarKinematics(PlacedOnTarget):
         dofs = of.surface.dofs[rows.facets]
         at_nodes = of.config.from_owners(of.nodes, pressure[:, None], dofs.ravel()).reshape(dofs.shape)
         parts = curvature(rows.points, at_nodes)
+        if of.of_gaps:
+            parts = parts + self._with_areas(pressure / rows.sharing)
         if along is None:
             return parts
         assert rows.weights is not None
@@ -194,6 +199,22 @@ class MortarKinematics(PlacedOnTarget):
         which = along.which[kept]
         frictional = Frictional(which, self.normal[which], along.tau[kept], ~along.held[kept])
         return parts + [(nodes, -blocks) for nodes, blocks in turning(of.elimination, rows, dofs, frictional, rows.weights)]
+
+    def _with_areas(self, pressure: Array) -> list[tuple[Ints, Array]]:
+        """What areas add to minus the second derivatives of mean gaps g under ``pressure (n,)``: ``p (grad a grad g' + grad g grad b')``.
+
+        The areas a are those of the dual functions, b the covered parts of reference areas (collective).
+        """
+        from uem_dolfinx.contact.seam.dyads import Terms as Gradients
+        from uem_dolfinx.contact.seam.dyads import dyads
+
+        of, rows, at = self.of, self.rows, self.rows.points
+        on_facet, on_target = at.area_derivatives(of.growth(rows.facets, at.x))
+        terms = terms_of(at.nodes, at.nodes, on_facet), terms_of(at.nodes[at.facet], at.opposite, on_target)
+        shares = terms_of(at.nodes, at.nodes, of.share_slopes(rows.facets, at.x)[1])
+        covered, whole = (Gradients(*of.elimination.at_owners(parts, np.ones(len(pressure)))) for parts in (terms, [shares]))
+        gaps, scale = self.gap_rows.gradients, pressure * rows.length / rows.share
+        return [dyads(scale, covered, gaps), dyads(scale * rows.ratio, gaps, whole)]
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Multipliers are current pressures with finite sliding, and forces over kept areas with small and fixed sliding (collective)."""

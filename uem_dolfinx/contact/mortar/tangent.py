@@ -132,6 +132,23 @@ class SegmentPoints:
         """Whether parts of facets do not grow as these do."""
         return self.shape.degree == 2 or self.radius is not None
 
+    def area_derivatives(self, growth: Array) -> tuple[Array, Array]:
+        """Derivatives of the dual functions' areas, from those of facets' sizes ``(m, nc, gdim)``; shapes as of ``gap_derivatives``."""
+        e, (k, nt) = self.facet[self.segments.pair], self.opposite.shape
+        grown = (self.covered.D / self.planes.size[:, None])[:, :, None, None] * growth[:, None]
+        if self.unequal:
+            stretched = self.stretching.reshape(len(e), growth.shape[1] * growth.shape[2])
+            weighted = products(self.segments.weight[:, None] * self.b, stretched)
+            grown += add_up(e, weighted, len(grown)).reshape(grown.shape)
+        on_target = np.zeros((k, grown.shape[1], nt, grown.shape[3]))
+        if self.other is not None:
+            which = self.partly_covered()
+            sides = self.sides(self.other, which).at_ends()
+            way = -(sides.weight[:, None] * sides.b)[:, :, None, None] * sides.way[:, None]
+            np.add.at(grown, self.facet[which][sides.pair], way[:, :, : grown.shape[1]])
+            np.add.at(on_target, which[sides.pair], way[:, :, grown.shape[1] :])
+        return self.duals.added(np.arange(len(grown)), grown), self.duals.added(self.facet, on_target)
+
     # -- first derivatives -----------------------------------------------------------------------------------------------
 
     def gap_derivatives(self) -> tuple[Array, Array]:

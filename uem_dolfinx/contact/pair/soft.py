@@ -2,7 +2,8 @@
 
 The gap g_i of a contactor has the gradient r_i, the row that hard contact unites with. Its force is ``lam_i = A_i p(g_i)`` with
 the area A_i of the pressure, so that the residual is ``F - sum_i r_i lam_i``. Its derivative has the terms ``-sum_i A_i p'(g_i)
-r_i r_i'`` and, as for hard contact, the curvature ``-sum_i lam_i grad^2 g_i``. Changes of areas are left out of the derivative.
+r_i r_i'`` and, as for hard contact, the curvature ``-sum_i lam_i grad^2 g_i``. Areas of mortar's mean gaps
+change with the bodies, which is part of both. Changes of current areas in pressures are left out of the derivative.
 
 Within a step the forces are those that the linearised problem predicts, as the multipliers of hard contact are, and the law holds at the
 gaps g_i* under them: the problem also closes what is left between g_i and g_i*. Any stiffness is then as good as hard contact, where
