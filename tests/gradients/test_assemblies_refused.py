@@ -52,7 +52,6 @@ ANNOUNCED = {
     "the shape, equations of rigid parts": (relation, {}, False, lambda s: {"controls": [s.E, s.X]}, "with couplings"),
     "the shape in time": (tie, {}, True, lambda s: {"controls": [s.X]}, "no derivatives by it in time"),
     "the displacement": (tie, {}, False, lambda s: {"controls": [s.u]}, "which the problem solves for"),
-    "a tangent in time": (tie, {}, True, lambda s: {"tangent": True}, "tangents of histories are of statics"),
 }
 
 
@@ -68,5 +67,5 @@ def test_refused_before_the_first_step(what):
 def test_announced_and_taken():
     """Controls that have derivatives change nothing."""
     s = assembly(feature=tie)
-    s.solve(2, True, controls=[s.E, s.X], tangent=True)
+    s.solve(2, True, controls=[s.E, s.X])
     assert len(s.history.gradient(s.J, [s.E, s.X])) == len(s.history.tangent([(s.E, 1.0)])) == 2

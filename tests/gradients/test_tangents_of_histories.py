@@ -1,4 +1,5 @@
-"""Tangents of histories: the derivative of all displacements, put into functionals, is the adjoint's, over friction, plasticity, preloads.
+"""Tangents of histories: the derivative of all displacements, put into functionals, is the adjoint's, over friction, plasticity,
+preloads, and motions.
 
 The adjoint's derivatives are of second order in tests of their own. Read first: ``test_forward_as_backward``.
 """
@@ -123,10 +124,31 @@ def test_the_place_of_one_of_two_planes():
     assert back == pytest.approx((solve(h)[0] - solve(-h)[0]) / (2 * h), rel=1e-6)
 
 
+MOTIONS = [
+    {"scheme": uem.generalised_alpha(0.7)},
+    slow({"law": uem.NeoHooke, "friction": 0.2, "damped": False}),
+    slow({"law": uem.NeoHooke, "scheme": uem.generalised_alpha(0.7), "shaken": True, "end": 0.3}),
+    slow({"friction": 0.2, "shaken": True}),
+]
+
+
+@pytest.mark.parametrize("how", MOTIONS)
+def test_through_motions(how):
+    """By what a motion with impact depends on, each alone and all at once: over initial state, damping, density and what shakes the top."""
+    s = thrown(**how)
+    found, two = s.solve(), np.ones(2)
+    assert any(active for _, active in found.states)
+    pairs = [(s.E, 90.0), (s.rho, 0.1), (s.force, two), (s.push, two), (s.velocity, wave(s.V, 0.2))]
+    pairs += [(s.viscosity, 1e-3)] if how.get("damped", True) else []
+    pairs += [(s.hand, wave(s.V, 0.1))] if how.get("shaken") else []
+    J = ufl.inner(s.u, s.u) * ufl.dx
+    for some in [*([pair] for pair in pairs if COMM.size == 1), pairs]:
+        onward, back = both(s.u, J, found.history, some)
+        assert onward == pytest.approx(back, rel=1e-8)
+
+
 def test_what_is_refused():
-    """Motions, histories without steps, and what has no derivative backwards either."""
-    s = thrown(wall=False, end=0.02, damped=False)
-    refused(uem.InputError, "in time take the gradient", lambda: s.solve().history.tangent([(s.E, 1.0)]))
+    """What is no direction, and the displacement."""
     s = dragged("triangle")
     steps = s.solve()
     refused(uem.InputTypeError, "direction = a Constant", lambda: steps.history.tangent(s.E))

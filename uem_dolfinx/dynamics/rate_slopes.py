@@ -1,4 +1,4 @@
-"""Derivatives of a time step by its initial state: displacement, velocity and acceleration, in reverse mode only.
+"""Derivatives of a time step by its initial state: displacement, velocity and acceleration, in both modes.
 
 With ``du = u(n+1) - u(n)``, the results of a step are linear in du and in the initial velocity v, acceleration a and mean velocity w,
 component by component: the acceleration b in the equation of motion, the velocity in the damping form, and v, a and w at the end. The
@@ -24,7 +24,7 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class ByState:
-    """Derivatives by the initial state of a step, at the owned components ``(n,)``.
+    """Derivatives by the initial state of a step, at the owned components ``(n,)``; forwards its changes.
 
     Attributes:
         u, v, a, w: by displacement, velocity, acceleration and mean velocity.
@@ -122,13 +122,67 @@ class RateSlopes:
 
     def by_density(self, a: Array) -> float:
         """Derivative by the logarithm of a density of all mass, before ``pass_back``, with the same ``a (n,)`` (collective)."""
-        d, alpha = self._dynamics, self._dynamics.scheme.alpha_f
-        weight, before = d.weight().array_r, d.forces.x.array[: self._n]
-        inertia = d.load().array_r + weight + alpha / (1.0 - alpha) * before
-        return float(reduced(d.config.comm, float((self.by.forces - a) @ inertia + a @ weight)))
+        inertia, weight = self._densities(False)
+        return float(reduced(self._dynamics.config.comm, float((self.by.forces - a) @ inertia + a @ weight)))
 
     def by_density_at_start(self, a: Array) -> float:
         """Derivative by the same logarithm through the first acceleration, with ``a (n,)`` of its adjoint problem (collective)."""
+        inertia, weight = self._densities(True)
+        return float(reduced(self._dynamics.config.comm, float((self.by.forces - a) @ inertia + a @ weight)))
+
+    def _densities(self, start: bool) -> tuple[Array, Array]:
+        """What is proportional to the density in the inertia forces, at the start or the end of a step, and weight (collective)."""
+        d, alpha = self._dynamics, self._dynamics.scheme.alpha_f
+        weight, before = d.weight().array_r, d.forces.x.array[: self._n]
+        if start:
+            return d.mass.times(d.acceleration.x.array[: self._n].reshape(-1, d.config.gdim)).ravel(), weight
+        return d.load().array_r + weight + alpha / (1.0 - alpha) * before, weight
+
+
+class RateChanges(RateSlopes):
+    """Changes through the time steps of a problem along a direction, from the first to the last; ``by`` is the change of the state.
+
+    Args:
+        dynamics: of the problem.
+        density: change of the logarithm of the density of all mass.
+    """
+
+    def __init__(self, dynamics: Dynamics, density: float = 0.0):
+        super().__init__(dynamics)
+        self._density = density
+
+    def pushed_at_start(self) -> Array:
+        """Change of the initial forces by the density ``(n,)`` (collective)."""
+        inertia, weight = self._densities(True)
+        return self._density * (inertia - weight)
+
+    def start(self, velocity: Array, acceleration: Array) -> None:
+        """Begin with changes of the initial velocity and acceleration ``(n,)`` (collective)."""
         d = self._dynamics
-        inertia, weight = d.mass.times(d.acceleration.x.array[: self._n].reshape(-1, d.config.gdim)).ravel(), d.weight().array_r
-        return float(reduced(d.config.comm, float((self.by.forces - a) @ inertia + a @ weight)))
+        inertia = d.mass.times(acceleration.reshape(-1, d.config.gdim)).ravel() + self._density * self._densities(True)[0]
+        self.by = ByState(np.zeros(self._n), velocity, acceleration, velocity, inertia)
+
+    def _after(self, rows: Array, du: Array) -> Array:
+        """Change of a result of the step, with its derivatives ``(4, n)`` and the change of its displacement."""
+        return np.asarray(rows[0] * du + rows[1] * self.by.v + rows[2] * self.by.a + rows[3] * self.by.w)
+
+    def _forces(self, du: Array) -> Array:
+        """Change of the inertia forces with that of the step's displacement (collective)."""
+        alpha = self._dynamics.scheme.alpha_f
+        changed = self._inertia(self._after(self._b, du)) - alpha / (1.0 - alpha) * self.by.forces
+        return np.asarray(changed + self._density * self._densities(False)[0])
+
+    def pushed(self) -> tuple[Array, Array]:
+        """Changes of inertia forces minus weight, and of the velocity in the damping form, at fixed final displacement (collective)."""
+        weight = self._density * self._densities(False)[1]
+        return self._forces(-self.by.u) - weight, self._after(self._damped, -self.by.u)
+
+    def beyond(self, v: Array) -> tuple[Array, Array]:
+        """Those of a change ``v (n,)`` of prescribed final displacements, as far as the tangent lacks them (collective)."""
+        return self._inertia(self._more_b * v), self._more_damped * v
+
+    def end(self, u: Array) -> None:
+        """Compute changes of the final state, with that of the final displacement (collective)."""
+        du = u - self.by.u
+        rates = (self._after(rows, du) for rows in (self._v, self._a, self._w))
+        self.by = ByState(u, *rates, self._forces(du))

@@ -15,24 +15,28 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
+from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.dynamics.rate_slopes import RateChanges
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
-from uem_dolfinx.gradients.assemblies import section_of
+from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.derivatives import Derivatives, along
 from uem_dolfinx.gradients.gradient import AnyControl
 from uem_dolfinx.gradients.linearised import Motion
 from uem_dolfinx.gradients.parameters import ContactParameter, motion_of
 from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.records import Record
-from uem_dolfinx.gradients.sweep import LinearisedStep, anchor_slopes_of
+from uem_dolfinx.gradients.sweep import LinearisedStep, accelerations, anchor_slopes_of, place_at_start
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.memory import Memory
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
 class ForwardStep(LinearisedStep):
-    """The constrained problem linearised at the end of a recorded step, forwards (collective)."""
+    """The constrained problem linearised at the end of a recorded step, forwards; arguments as of ``LinearisedStep`` (collective)."""
+
+    _rates: RateChanges | None
 
     def set_operator(self) -> None:
         """Set the matrix ``Q'(K + G)P`` (collective)."""
@@ -42,6 +46,32 @@ class ForwardStep(LinearisedStep):
         """``P dq`` with ``Q'(K + G)P dq = Q' forces`` (collective)."""
         dq, _ = self.problem.solver.solve(self.Q.transpose(forces))
         return self.P.expand(self.problem.solver.complete(dq))
+
+    def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
+        """``(K + G) du``, with what K lacks at prescribed displacements (collective)."""
+        found = super().stiffness(du)
+        if self._rates is not None:
+            inertia, speed = self._rates.beyond(np.array(du.array_r))
+            found.array[:] += inertia + damping_along(self.problem, speed)
+        return found
+
+
+def forces_along(problem: UnitedProblem, m: Any, change: Any) -> Array | float:
+    """Change of the residual along that of a Constant or a Function, in the rows of vectors ``(n,)`` (collective)."""
+    form = along(problem.bodies.F, m, change)
+    if form is None:
+        return 0.0
+    return np.asarray(problem.config.rows(forms.assemble_array(problem.u.function_space, forms.form(form))).ravel())
+
+
+def damping_along(problem: UnitedProblem, speed: Array) -> Array | float:
+    """Change of the forces of damping with that of its velocity ``(n,)``; 0 without damping (collective)."""
+    if problem.dynamics is None or problem.dynamics.damping is None:
+        return 0.0
+    change = fem.Function(problem.config.V)
+    change.x.array[: len(speed)] = speed
+    change.x.scatter_forward()
+    return forces_along(problem, problem.dynamics.past, change)
 
 
 class Forward:
@@ -61,8 +91,40 @@ class Forward:
         self._anchors = [np.zeros((0, 0))] * len(problem.pairs)
         self._sections = [section_of(contact) for contact in problem.contacts]
         self._openings = [0.0] * len(self._sections)
+        self._rates = None if problem.dynamics is None else RateChanges(problem.dynamics, self._density())
         laws: list[Any] = problem.materials
         self._laws = [law.slopes(self._derivatives.a, self._derivatives.test, True) for law in laws]
+
+    def _density(self) -> float:
+        """Change of the logarithm of the density."""
+        dynamics, found = self.problem.dynamics, 0.0
+        for m, change in self._direction:
+            if isinstance(m, fem.Constant) and dynamics is not None and m is dynamics.mass.density:
+                found += float(change / m.value)
+        return found
+
+    def accelerate(self, start: Record) -> None:
+        """Compute changes of the first velocity and acceleration, with the problem set to the start (collective)."""
+        problem, dynamics = self.problem, self.problem.dynamics
+        if dynamics is None or self._rates is None:
+            return
+        place_at_start(problem, [control for control, _ in self._direction])
+        users, n = Users(problem, 0.0), problem.config.n_owned * problem.config.gdim
+        forces, velocity = np.array(self._rates.pushed_at_start()), np.zeros(n)
+        for m, change in self._direction:
+            if isinstance(m, fem.Constant):
+                change = start.shares.get(id(m), 1.0) * np.asarray(change, dtype=float)
+                forces += forces_along(problem, m, change)
+                if users.have(m):
+                    forces += users.changes(m, change)[1].ravel()
+            elif isinstance(m, fem.Function):
+                forces += forces_along(problem, m, change)
+                velocity += change.x.array[:n] if m is dynamics.start_velocity else 0.0
+            elif isinstance(m, ContactParameter) and (section := section_of(m.contact)) is not None:
+                forces += float(change) * by_section(section, m.parameter, 0)[1].ravel()
+        forces += damping_along(problem, velocity)
+        acceleration = np.where(dynamics.massy.ravel(), -accelerations(problem, forces).array_r[:n], 0.0)
+        self._rates.start(velocity, acceleration)
 
     def begin(self, first: Record) -> None:
         """Compute changes of the anchors before the first step (collective)."""
@@ -82,7 +144,7 @@ class Forward:
 
     def advance(self, record: Record) -> None:
         """Process a step, with the problem set to its end (collective)."""
-        step = ForwardStep(self.problem, record, self._derivatives, None)
+        step = ForwardStep(self.problem, record, self._derivatives, self._rates)
         with step:
             gaps, pushed = np.zeros_like(step.multipliers), np.zeros((step.config.n_owned, step.config.gdim))
             first = 0
@@ -96,6 +158,10 @@ class Forward:
                     pushed += forces
                 if section is not None and section.locked and not section.shortened:
                     gaps[which] -= section.along[: len(own)] * opening
+            if self._rates is not None:
+                self._rates.begin()
+                inertia, speed = self._rates.pushed()
+                pushed += np.reshape(inertia + damping_along(self.problem, speed), pushed.shape)
             for law in self._laws:
                 forces, bulk = law.begin_along(self._direction)
                 if (form := along(step.F, law.bulk, bulk)) is not None:
@@ -107,6 +173,8 @@ class Forward:
 
     def _end(self, step: ForwardStep, motion: Motion) -> None:
         """Compute changes of the history at the end of a step (collective)."""
+        if self._rates is not None:
+            self._rates.end(self._at_nodes(motion.du).ravel())
         self._follow(step.slopes, self._at_nodes(motion.du) + self._at_nodes(motion.shape), False)
         for k, section in enumerate(self._sections):
             if section is not None and not section.locked:

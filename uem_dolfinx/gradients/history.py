@@ -195,7 +195,7 @@ class History(given.Sealed):
     def tangent(self, direction: Sequence[tuple[AnyControl, Any]]) -> list[fem.Function]:
         """Derivatives of the displacements of all steps along changes of parameters, by one linear solve a step (collective).
 
-        Exact as ``gradient``, whose controls may be changed; for statics.
+        Exact as ``gradient``, whose controls may be changed.
 
             by_mu = history.tangent([(uem.ContactParameter(contact, "friction"), 1.0)])[-1]
 
@@ -213,7 +213,6 @@ class History(given.Sealed):
         with agreed(problem.comm):
             if not len(self):
                 raise InputError("the history has no step: expected steps to be taken while it is recorded")
-        self.check_tangent()
         controls = [control for control, _ in pairs]
         refuse_idle_controls(problem, "direction", controls)
         self.check_controls(controls, "direction")
@@ -222,6 +221,9 @@ class History(given.Sealed):
 
         forward = Forward(problem, pairs)
         with self._replayed():
+            if self._start is not None:
+                self._place(self._start)
+                forward.accelerate(self._start)
             for k in range(len(self)):
                 record = self._placed(k)
                 if k == 0:
@@ -229,12 +231,6 @@ class History(given.Sealed):
                     self._place(record)
                 forward.advance(record)
         return forward.found
-
-    def check_tangent(self) -> None:
-        """Refuse problems of whose histories there is no tangent (collective)."""
-        with agreed(self.problem.comm):
-            if self.problem.dynamics is not None:
-                raise InputError("tangents of histories are of statics: in time take the gradient of a functional")
 
     @contextmanager
     def _replayed(self) -> Iterator[None]:

@@ -25,7 +25,6 @@ def recording(
     *,
     scratch: str | Path | None = None,
     controls: Sequence[AnyControl] | AnyControl = (),
-    tangent: bool = False,
 ) -> Iterator[History]:
     """Record all steps of a problem in a ``with`` block, for gradients through their history (collective).
 
@@ -45,7 +44,6 @@ def recording(
             ``VonMises`` as law with history.
         scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
         controls: of the derivatives that are wanted later, if known: those without derivatives are refused before the first step.
-        tangent: likewise, whether ``tangent`` is wanted.
 
     Yields: The history, which may be used in the block and after it.
 
@@ -82,12 +80,9 @@ def recording(
             history = History(problem, None if scratch is None else Path(scratch))
         except OSError as error:
             raise InputError(f"scratch = {scratch!r}: cannot write there ({error}); expected a folder on every rank") from error
-    given.kind("tangent", tangent, isinstance(tangent, bool), "True or False")
     wanted = [controls] if isinstance(controls, AnyControl) else controls
     if not isinstance(wanted, tuple) or wanted:
         history.check_controls(check_controls(problem, "controls", wanted, later=True))
-    if tangent:
-        history.check_tangent()
     problem.history = history
     try:
         yield history

@@ -170,15 +170,11 @@ class Sweep:
 
         With ``a = -P (P'MP)^-1 P'F`` under the initial forces F, a functional with derivative b by a has ``-P (P'MP)^-1 P'b`` by F.
         """
-        problem, dynamics, system = self.problem, self.problem.dynamics, self.problem.system
+        problem, dynamics = self.problem, self.problem.dynamics
         if dynamics is None or self._rates is None:
             return
-        assert isinstance(system, BodySystem)
-        system.place()
-        system.floating.begin_motion()
-        self._refuse_turns()
-        b = problem.config.vector(self._rates.by_acceleration())
-        a = united_accelerations(dynamics.matrix, system.restriction(), b)
+        place_at_start(problem, self._controls)
+        a = accelerations(problem, self._rates.by_acceleration())
         by_velocity = self._rates.by.v + self._rates.by.w - damped_by(problem, self._derivatives, a)
         terms = [(self._derivatives.work, -1.0)]
         for k, m in enumerate(self._controls):
@@ -208,15 +204,29 @@ class Sweep:
         """Work of forces at the owned nodes ``(n_owned, gdim)`` along a (collective)."""
         return np.asarray(reduced(self.problem.comm, float(a.array_r[: forces.size] @ forces.ravel())))
 
-    def _refuse_turns(self) -> None:
-        """Refuse parameters of rigid targets if contactors touch at the start, and so affect the first acceleration (collective)."""
-        for m in self._controls:
-            moves = isinstance(m, ContactParameter) and m.parameter in ("place", "turn")
-            if moves and reduced(self.problem.comm, int(m.contact.pair.trial.active.sum())):
-                raise InputError(
-                    f"contact '{m.contact.name}' touches at the start, where the first acceleration has no derivative by its "
-                    f"{m.parameter}: expected a motion that begins before it touches"
-                )
+
+def place_at_start(problem: UnitedProblem, controls: Sequence[AnyControl]) -> None:
+    """Place the contacts of a problem that is set to the start of its motion (collective).
+
+    Raises:
+        InputError: for parameters of rigid targets that contactors touch then, and that so affect the first acceleration.
+    """
+    assert isinstance(problem.system, BodySystem)
+    problem.system.place()
+    problem.system.floating.begin_motion()
+    for m in controls:
+        moves = isinstance(m, ContactParameter) and m.parameter in ("place", "turn")
+        if moves and reduced(problem.comm, int(m.contact.pair.trial.active.sum())):
+            raise InputError(
+                f"contact '{m.contact.name}' touches at the start, where the first acceleration has no derivative by its "
+                f"{m.parameter}: expected a motion that begins before it touches"
+            )
+
+
+def accelerations(problem: UnitedProblem, forces: Array) -> PETSc.Vec:
+    """``P (P'MP)^-1 P'`` times forces ``(n,)``, at the start of a motion (collective)."""
+    assert isinstance(problem.system, BodySystem) and problem.dynamics is not None
+    return united_accelerations(problem.dynamics.matrix, problem.system.restriction(), problem.config.vector(forces))
 
 
 class LinearisedStep(Linearised):
