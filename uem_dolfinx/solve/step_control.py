@@ -39,6 +39,7 @@ class StepControl:
         number: number of completed steps.
         largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
         largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
+        accurate: longest step that errors of the last ones in time let expect to be accurate.
         due: number of the step after which explicit steps look at how fast edges of cells are stretched.
         stretch: of these until then, since the critical step was found.
         resolved: bound on the length of explicit steps that resolve contacts on a stiff surface.
@@ -49,7 +50,7 @@ class StepControl:
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
         self._cuts, self._read, self._longest_before, self.due, self.stretch, self.resolved = 0, False, np.inf, 0, 0.0, np.inf
-        self.of_contact, self.shortest = False, np.inf
+        self.of_contact, self.shortest, self.accurate = False, np.inf, np.inf
 
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
@@ -140,6 +141,7 @@ class StepControl:
         return kept | {
             "nominal length": self.nominal,
             "largest speed": self.largest_speed,
+            "accurate step": self.accurate,
             "critical step due": self.due,
             "stretch of cells": self.stretch,
             "resolved step": self.resolved,
@@ -151,11 +153,12 @@ class StepControl:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
         # files of earlier versions lack these
         kept = {
-            "largest speed": 0.0, "critical step due": 0, "stretch of cells": np.inf, "resolved step": np.inf, "shortest edge": np.inf,
+            "largest speed": 0.0, "accurate step": np.inf, "critical step due": 0, "stretch of cells": np.inf, "resolved step": np.inf,
+            "shortest edge": np.inf,
         } | kept  # fmt: skip
         kept.setdefault("steps of contact", False)
         (
-            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.due, self.stretch, self.resolved,
-            self.of_contact, self.shortest,
+            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.accurate, self.due, self.stretch,
+            self.resolved, self.of_contact, self.shortest,
         ) = (kept[name] for name in self.to_checkpoint())  # fmt: skip
         self._read, self._longest_before = True, self.longest

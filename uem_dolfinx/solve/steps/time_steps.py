@@ -35,9 +35,10 @@ if TYPE_CHECKING:
 #: Rounding of a time, a few units in its last place.
 #: [derived; largest time; test_thresholds_motion.py::test_steps_lost_in_rounding]
 TIME_ROUNDING = 4 * np.finfo(float).eps
-#: The error of a step over its length grows so much if the length doubles.
-#: [derived; error over length; test_accuracy_in_time.py::test_steps_are_doubled_in_time]
-ORDER_TWO = 4.0
+#: During a step the longest accurate step grows by at most this multiple of its length and of the root of the tolerance. So it doubles in
+#: half a period of the vibration that it resolves, and does not grow where this turns, whose speed the estimate does not see.
+#: [convention; length times root of tolerance; test_accuracy_in_time.py::test_steps_are_doubled_in_time]
+GROWS = 1.0
 
 
 def time_steps(
@@ -210,7 +211,10 @@ def _accurate(problem: UnitedProblem, dynamics: Dynamics, length: float, accurac
         raise StepAccuracyError(
             f"the error of a step of {length:.3g} is {found:.3g} of the displacement at the largest speed, above the tolerance {accuracy:g}"
         )
-    return ORDER_TWO * found <= accuracy
+    # the error over the length is of second order in it
+    longest = length * float(np.sqrt(accuracy / found)) if found else np.inf
+    control.accurate = min(longest, control.accurate + GROWS * float(np.sqrt(accuracy)) * length)
+    return 2.0 * length <= control.accurate
 
 
 def _contact_forces(problem: UnitedProblem) -> list[Array]:
