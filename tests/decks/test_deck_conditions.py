@@ -214,6 +214,38 @@ def test_temperatures(folder):
     assert np.array(found) == pytest.approx(ALPHA * np.outer([100.0, 100.0, 200.0], [1.0, 1.0, 2.0]), rel=1e-9)
 
 
+SPUN = "*DLOAD\nbody 1, CENTRIF, 2., 0.5, 0.25, 0., 0., 1., 3.\n"
+MASSES = {
+    "weight": ("*DLOAD\nbody 1, GRAV, 4., 0., 3., -8.\n", (-2.749631e-3, 7.902200e-2, 7.607675e-4), 1e-6),
+    "about an axis": (SPUN, (7.985714e-4, -1.813036e-2, -4.897917e-3), 1e-6),
+    # at the deformed positions; at those before 8.0e-4 along x
+    "at large displacements": (SPUN, (1.007373e-3, -1.921679e-2, -5.214223e-3), 4e-3),
+}
+
+
+@pytest.mark.parametrize("case", MASSES)
+def test_loads_on_masses(folder, case):
+    """Gravity, and centrifugal forces about an inclined axis: displacements of CalculiX 2.20 for the same deck."""
+    load, wanted, rel = MASSES[case]
+    text = column(load).replace("*EXPANSION", "*DENSITY\n2.5\n*EXPANSION")
+    deck = read(folder, text.replace("*STEP", "*STEP, NLGEOM") if "large" in case else text)
+    list(deck.run())
+    assert deck.displacement(121) == pytest.approx(wanted, rel=rel) and deck.left_out == []
+
+
+def test_weights_of_steps(folder):
+    """A column under its weight, ``rho g L^2 / 2 E`` at its head: of both elements, of the lower one, and ended by OP=NEW."""
+    steps = [
+        "*DLOAD\nbody 1, GRAV, 8., 0., 0., -1.\n",
+        "*DLOAD, OP=NEW\n10, GRAV, 8., 0., 0., -1.\n",
+        "*DLOAD, OP=NEW\n11, P2, 1.\n",
+    ]
+    found, deck = heights(folder, column(*steps, nu=0.0).replace("*EXPANSION", "*DENSITY\n2.5\n*EXPANSION"))
+    assert found == pytest.approx([-2.5 * 8.0 * 2.0 / E, -2.5 * 8.0 * 0.5 / E, -2.0 / E], rel=1e-9) and deck.left_out == []
+    refused(uem.InputError, ("'STEEL' has no *DENSITY", "mass of"), lambda: read(folder, column(steps[0])))
+    refused(uem.InputError, ("*DLOAD", "expected a direction"), lambda: read(folder, column("*DLOAD\nbody 1, GRAV, 8.\n")))
+
+
 def test_what_is_said(folder):
     """Options that are not taken, and elements that are integrated otherwise, are named."""
     step = "*BOUNDARY, LOAD CASE=2\nhead 1, 1, 1\n*CLOAD, USER\nhead 1, 3, -1.\n"

@@ -22,8 +22,6 @@ from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.conductance import Conductance
-from uem_dolfinx.contact.laws.exponential import Exponential
-from uem_dolfinx.contact.laws.soft import SoftContact
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.decks.model import model_of
 from uem_dolfinx.decks.parts import TEMPERATURE, Course, Interaction, Linear, Model, Pair, Step
@@ -300,7 +298,7 @@ class Deck(given.Sealed):
         friction = law.friction or max([step.friction.get(pair.interaction, 0.0) for step in self.steps], default=0.0)
         how |= {"friction": friction} if friction else {}
         if self._soft and law.numbers and not friction:
-            how["normal"] = _soft(law)
+            how["normal"] = law.soft()
         elif law.overclosure != "HARD":
             hard = ", as friction does not go with soft contact" if self._soft and friction else ""
             self.left_out.append(f"PRESSURE-OVERCLOSURE={law.overclosure} of '{name}': contact is hard{hard}")
@@ -332,7 +330,23 @@ class Deck(given.Sealed):
         for where in dict.fromkeys(where for step in self.steps for where in step.pressures):
             pressed = self._driven_by("pressures", where) * ufl.dot(ufl.FacetNormal(self.mesh), v)
             F += pressed * ds(self._outside(self._tag(where[0])))
+        for where in dict.fromkeys(where for step in self.steps for where in step.bodies):
+            tag, x = self._tag(where[0]), ufl.SpatialCoordinate(self.mesh)
+            # bodies that turn move out
+            x = x + w if law_of is StVenantKirchhoff else x
+            F -= self._driven_by("bodies", where) * self._density(tag) * ufl.inner(where[1].acceleration(x), v) * dx(tag)
         return F
+
+    def _density(self, tag: Tag) -> fem.Function:
+        """The density in cells; InputError for materials without, of cells of a tag (collective)."""
+        rho = fem.Function(compat.function_space(self.mesh, ("DG", 0)))
+        dofs = compat.cell_dofs(rho.function_space)[:, 0]
+        for elements, name in self._model.sections:
+            cells = self._tag(elements).entities
+            rho.x.array[dofs[cells]] = density = self._model.materials[name].density
+            if reduced(self.mesh.comm, not density and bool(np.isin(cells, tag.entities).any()), op=MPI.LOR):
+                raise InputError(f"material '{name}' has no *DENSITY, and a load acts on the mass of {tag}")
+        return rho
 
     def _outside(self, tag: Tag) -> Tag:
         """A surface that is pressed; InputError if it has sides between two elements."""
@@ -381,24 +395,12 @@ class Deck(given.Sealed):
         field.x.scatter_forward()
 
 
-def _soft(law: Interaction) -> SoftContact:
-    """The law of pressure of an interaction; InputError for another word than those of CalculiX."""
-    first, *rest = law.numbers[0]
-    if law.overclosure == "LINEAR":
-        return SoftContact(first)
-    if law.overclosure == "EXPONENTIAL":
-        # the pressure at c0 is a hundredth of p0
-        return SoftContact(Exponential(p0=rest[0], h=first / np.log(100.0)))
-    if law.overclosure == "TABULAR":
-        return SoftContact(sorted((-overclosure, p) for p, overclosure in law.numbers))
-    raise InputError(f"PRESSURE-OVERCLOSURE = {law.overclosure}: expected HARD, LINEAR, EXPONENTIAL, TABULAR or TIED")
-
-
 def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
     """Read a deck of Abaqus or CalculiX with its materials, conditions, contacts, steps and loads as a problem (collective).
 
     Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
-    ``*BOUNDARY``, ``*CLOAD``, pressures by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``, ``*CONTACT PAIR``, ``*TIE``,
+    ``*BOUNDARY``, ``*CLOAD``, pressures, ``GRAV`` and ``CENTRIF`` by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``,
+    ``*CONTACT PAIR``, ``*TIE``,
     ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of contact pairs,
     ``*RIGID BODY`` and ``*PRE-TENSION SECTION``, whose surface is cut; values that follow an ``*AMPLITUDE``, or are in the directions of
     a ``*TRANSFORM``; steps ``*STATIC``, ``*HEAT TRANSFER`` and

@@ -13,6 +13,7 @@ from uem_dolfinx.decks.parts import (
     STEP_KINDS,
     TEMPERATURE,
     Acting,
+    BodyLoad,
     Course,
     Interaction,
     Linear,
@@ -220,13 +221,14 @@ class _Reader:
         self._met, self._own, self._changed = set(), set(), ""
         self._step = Step(
             nlgeom="NLGEOM" in options and options["NLGEOM"].upper() != "NO", held=_kept(last.held, last),
-            forces=_kept(last.forces, last), pressures=_kept(last.pressures, last), temperatures=dict(last.temperatures),
+            forces=_kept(last.forces, last), pressures=_kept(last.pressures, last), bodies=_kept(last.bodies, last),
+            temperatures=dict(last.temperatures),
         )  # fmt: skip
 
-    def _begins(self, kind: str, acting: dict[Any, Any], options: dict[str, str]) -> None:
+    def _begins(self, kind: str, options: dict[str, str], *acting: dict[Any, Any]) -> None:
         """Let the first keyword of a kind in a step end what acted before, with ``OP=NEW``."""
-        if options.get("OP", "MOD").upper() == "NEW" and kind not in self._met:
-            acting.clear()
+        for one in acting if options.get("OP", "MOD").upper() == "NEW" and kind not in self._met else ():
+            one.clear()
         self._met.add(kind)
 
     def _add(self, kind: str, acting: Acting, where: tuple[Any, Any], value: Value) -> None:
@@ -249,7 +251,7 @@ class _Reader:
     def _boundary(self, options: dict[str, str], rows: list[list[str]]) -> None:
         if "FIXED" in options:
             raise InputError("FIXED holds displacements that steps before have reached: expected values")
-        self._begins("BOUNDARY", self._step.held, options)
+        self._begins("BOUNDARY", options, self._step.held)
         for row in rows:
             where, first, last, value = [*row, "", ""][:4]
             first, last = NAMED_HOLDS.get(first.upper(), (first, last))
@@ -259,14 +261,20 @@ class _Reader:
                     self._step.held |= {(one, dof): self._value(value, options) for one in nodes_of(self._deck, where)}
 
     def _cload(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        self._begins("CLOAD", self._step.forces, options)
+        self._begins("CLOAD", options, self._step.forces)
         for where, dof, value in (row[:3] for row in rows):
             if self._has(where, int(dof), _numbers([value])[0], "CLOAD"):
                 for one in nodes_of(self._deck, where):
                     self._add("CLOAD", self._step.forces, (one, int(dof)), self._value(value, options))
 
     def _dload(self, options: dict[str, str], rows: list[list[str]]) -> bool:
-        self._begins("DLOAD", self._step.pressures, options)
+        self._begins("DLOAD", options, self._step.pressures, self._step.bodies)
+        of_bodies = [row for row in rows if row[1].upper() in ("GRAV", "CENTRIF")]
+        for who, label, value, *numbers in of_bodies:
+            if who.isdigit():
+                self._deck.elsets.setdefault(f"ELEMENT {who}", (f"element {who}", [int(who)]))
+            where = f"element {who}" if who.isdigit() else who, BodyLoad.of(label.upper(), _numbers(numbers))
+            self._add("DLOAD", self._step.bodies, where, self._value(value, options))
         pressing = [row for row in rows if re.fullmatch(r"P\d?", row[1].upper())]
         for who, label, value in (row[:3] for row in pressing):
             of_elements, sides = self._deck.surfaces.get(who, (False, []))
@@ -276,10 +284,10 @@ class _Reader:
                 own = self._deck.elsets.get(member.upper(), ("", [member]))[1] if side else [member]
                 for one in own:
                     self._add("DLOAD", self._step.pressures, (str(one), side.upper()), self._value(value, options))
-        return len(pressing) == len(rows)
+        return len(pressing) + len(of_bodies) == len(rows)
 
     def _temperature(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        self._begins("TEMPERATURE", self._step.temperatures, options)
+        self._begins("TEMPERATURE", options, self._step.temperatures)
         _last(self._step.temperatures, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
 
     def _change(self, options: dict[str, str], rows: list[list[str]]) -> bool:

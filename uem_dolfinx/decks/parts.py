@@ -6,7 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+import ufl
 
+from uem_dolfinx.contact.laws.exponential import Exponential
+from uem_dolfinx.contact.laws.soft import SoftContact
 from uem_dolfinx.errors import InputError
 
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
@@ -63,6 +66,38 @@ def together(one: Value, other: Value, where: Any) -> Value:
     raise InputError(f"loads of two amplitudes act at {where}: expected one")
 
 
+@dataclass(frozen=True)
+class BodyLoad:
+    """A load on the mass of elements.
+
+    Attributes:
+        label: ``"GRAV"`` along a direction, or ``"CENTRIF"`` away from an axis.
+        numbers: a point of the axis ``(3,)``, and its direction, or that of gravity, of length 1.
+    """
+
+    label: str
+    numbers: tuple[float, ...]
+
+    @staticmethod
+    def of(label: str, numbers: list[float]) -> BodyLoad:
+        """From the numbers of a row; InputError for a direction of no length."""
+        n = 3 if label == "GRAV" else 6
+        numbers = [*numbers, *6 * [0.0]][:n]
+        length = float(np.linalg.norm(numbers[-3:]))
+        if not length:
+            raise InputError(f"{label} along {numbers[-3:]}: expected a direction")
+        return BodyLoad(label, (*numbers[:-3], *(value / length for value in numbers[-3:])))
+
+    def acceleration(self, x: Any) -> Any:
+        """At positions x, an expression, for a value of 1, which about an axis is the square of a speed."""
+        g, direction = len(x), ufl.as_vector(self.numbers[-3:])
+        if self.label == "GRAV":
+            return ufl.as_vector([direction[c] for c in range(g)])
+        away = ufl.as_vector([(x[c] if c < g else 0.0) - self.numbers[c] for c in range(3)])
+        away = away - ufl.dot(away, direction) * direction
+        return ufl.as_vector([away[c] for c in range(g)])
+
+
 @dataclass
 class Material:
     """Numbers of a material; None are not given."""
@@ -82,6 +117,18 @@ class Interaction:
     numbers: list[list[float]] = field(default_factory=list)
     friction: float = 0.0
     conductance: list[list[float]] = field(default_factory=list)
+
+    def soft(self) -> SoftContact:
+        """Its law of pressure; InputError for another word than those of CalculiX."""
+        first, *rest = self.numbers[0]
+        if self.overclosure == "LINEAR":
+            return SoftContact(first)
+        if self.overclosure == "EXPONENTIAL":
+            # the pressure at c0 is a hundredth of p0
+            return SoftContact(Exponential(p0=rest[0], h=first / np.log(100.0)))
+        if self.overclosure == "TABULAR":
+            return SoftContact(sorted((-overclosure, p) for p, overclosure in self.numbers))
+        raise InputError(f"PRESSURE-OVERCLOSURE = {self.overclosure}: expected HARD, LINEAR, EXPONENTIAL, TABULAR or TIED")
 
 
 @dataclass
@@ -123,6 +170,7 @@ class Step:
     held: dict[Where, Value] = field(default_factory=dict)
     forces: dict[Where, Value] = field(default_factory=dict)
     pressures: dict[Where, Value] = field(default_factory=dict)
+    bodies: dict[tuple[str, BodyLoad], Value] = field(default_factory=dict)
     temperatures: dict[str, float] = field(default_factory=dict)
     contacts: dict[tuple[str, str], bool] = field(default_factory=dict)
     friction: dict[str, float] = field(default_factory=dict)
