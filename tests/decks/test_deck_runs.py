@@ -221,7 +221,7 @@ def test_heat_in_steps_of_time(folder):
 def test_what_is_left_out(folder, caplog):
     """Keywords without counterpart are named, in the log as well; requests of output are not among them."""
     step = "*STEP\n*STATIC\n*CLOAD, AMPLITUDE=a\nhead 2, 3, -1.\n"
-    step += "*DLOAD\nbody 1, GRAV, 9.81, 0., 0., -1.\n*NODE PRINT, NSET=all\nU\n*END STEP\n"
+    step += "*DLOAD\nbody 1, NEWTON\n*NODE PRINT, NSET=all\nU\n*END STEP\n"
     text = two(material=STEEL + "*PLASTIC\n300., 0.\n", step="*AMPLITUDE, NAME=a, SHIFTX=1.\n0., 0., 1., 1.\n" + step)
     deck = uem.read_deck(written(folder, text), COMM)
     assert [one.partition(":")[0] for one in deck.left_out] == ["*PLASTIC", "SHIFTX of *AMPLITUDE", "*DLOAD"]
