@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, box, linear, refused, scene
+from helpers import at, box, linear, refused, scene, slow
 from ramp_scenes import COMM, forming, ramped
 
 import uem_dolfinx as uem
@@ -71,29 +71,40 @@ def test_steps_are_doubled_in_load(path):
     assert error(problem) < error(equal)
 
 
-def turning(tolerance, path, comm=COMM):
-    """A block that yields where its top is pressed by ``path`` times a part of its height: largest plastic strain, and steps."""
+def turning(tolerance, path, by="values", comm=COMM):
+    """A block that yields, pressed by ``path`` times a part of its height at its top or between both: largest plastic strain, and steps."""
     mesh, tags = uem.read_gmsh(uem.example_mesh("two_blocks"), comm, gdim=2, parameters={"n_lower": 2, "n_upper": 3})
     V = uem.function_space(mesh, 1, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     flows, depth = uem.VonMises(u, 100.0, 0.3, 1.0, 10.0, kind="plane_strain"), fem.Constant(mesh, np.zeros(2))
-    bcs = [uem.dirichlet(V, tags["lower_bottom"]), uem.dirichlet(V, tags["upper_top"], value=depth)]
+    bcs = [uem.dirichlet(V, tags["lower_bottom"])]
     contact = uem.Contact(tags["upper_bottom"], tags["lower_top"])
+    how = {"bcs": bcs, "contacts": [contact], "materials": [flows]}
 
     def load(f):
-        depth.value[1] = -0.04 * path(f)
+        if by == "offset":
+            contact.offset = 0.04 * path(f)
+        else:
+            depth.value[1] = -0.04 * path(f)
 
-    problem = uem.UnitedProblem(flows.residual(v), u, bcs=bcs, contacts=[contact], materials=[flows], load=load)
+    if by == "coupling":
+        motion = (0.0, lambda f: -0.04 * path(f), 0.0)
+        how["couplings"] = [uem.RigidCoupling(tags["upper_top"], point=(0.5, 2.0), motion=motion)]
+    else:
+        bcs.append(uem.dirichlet(V, tags["upper_top"], value=depth))
+        how["load"] = load
+    problem = uem.UnitedProblem(flows.residual(v), u, **how)
     steps = list(uem.load_steps(problem, 1, tolerance=tolerance))
     return comm.allreduce(flows.peeq.x.array.max(initial=0.0), op=MPI.MAX), steps
 
 
-def test_a_load_that_turns():
+@pytest.mark.parametrize("by", ["values", slow("coupling"), slow("offset")])
+def test_a_load_that_turns(by):
     """To and fro within a part of a step, with zeros at its ends and middle: the halves alone would not see it."""
-    exact, _ = turning(None, lambda f: f)
-    found, steps = turning(3e-3, lambda f: np.interp(f, [0.0, 0.13, 0.26, 1.0], [0.0, 1.0, 0.0, 0.0]))
+    exact, _ = turning(None, lambda f: f, by)
+    found, steps = turning(3e-3, lambda f: np.interp(f, [0.0, 0.13, 0.26, 1.0], [0.0, 1.0, 0.0, 0.0]), by)
     assert abs(found / exact - 1) < 0.1 and sum(step.cuts for step in steps) > 0
-    straight, steps = turning(3e-3, lambda f: f)
+    straight, steps = turning(3e-3, lambda f: f, by)
     assert abs(straight / exact - 1) < 3e-3 and len(steps) == 1
 
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.conditions.rigid_set import velocities
 from uem_dolfinx.errors import StepAccuracyError
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.checks import depends_on_path
@@ -47,7 +49,8 @@ class Reached:
     def loaded(cls, problem: UnitedProblem, factor: float) -> Reached:
         """Dirichlet values, and forces at the committed displacement, under the load of a factor (collective).
 
-        Active contactors on rigid surfaces have the opposite of the displacement of these, which slip depends on.
+        Active contactors on rigid surfaces have the opposite of the displacement of these, which slip depends on, and move by offsets.
+        Nodes of rigid couplings move by the prescribed components.
         """
         problem.set_load(factor)
         there, n, bodies = cls.of(problem), problem.config.n_owned, problem.bodies
@@ -56,6 +59,12 @@ class Reached:
             now, x, active = pair.target.motion, pair.points, pair.committed.active
             X = x if before is None else before.back(x)
             values[pair.nodes[active]] += (x - (X if now is None else now.carry(X)))[active]
+            if (offset := pair.discretisation.offset) is not None:
+                values[pair.nodes[active]] += (offset[:, None] * pair.kinematics.normal)[active]
+        for one in problem.couplings:
+            at = one.nodes.placement(problem.config.of(problem.committed)[:n])
+            rates = velocities(at.arms(one.nodes.X) - at.arms(one.point[None]))
+            values[one.nodes.nodes] += rates[:, :, list(one.prescribed)] @ one.wanted()
         return cls(values, there.forces)
 
     def apart(self, other: Reached, stiffness: Array) -> Array:
@@ -94,7 +103,8 @@ class ByError(ByLoad):
     def _step(self, done: float, factor: float) -> list[Iteration]:
         """Reach a load factor by two steps, whose difference from one step is their error, and commit these (collective)."""
         problem, self.shorter = self._problem, 0.5
-        turn = self._largest_turn(done, factor) if callable(problem.load) and depends_on_path(problem) else 0.0
+        turns = callable(problem.load) or any(given.function(value) for one in problem.couplings for value in one.values_given())
+        turn = self._largest_turn(done, factor) if turns and depends_on_path(problem) else 0.0
         problem.set_load(done)
         start = Reached.of(problem)
         self._reach(factor, problem.attempt)
