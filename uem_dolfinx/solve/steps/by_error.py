@@ -59,7 +59,7 @@ class Reached:
             now, x, active = pair.target.motion, pair.points, pair.committed.active
             X = x if before is None else before.back(x)
             values[pair.nodes[active]] += (x - (X if now is None else now.carry(X)))[active]
-            if (offset := pair.discretisation.offset) is not None:
+            if (offset := pair.discretisation.setting.offset) is not None:
                 values[pair.nodes[active]] += (offset[:, None] * pair.kinematics.normal)[active]
         for one in problem.couplings:
             at = one.nodes.placement(problem.config.of(problem.committed)[:n])
