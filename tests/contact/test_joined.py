@@ -19,11 +19,11 @@ from dolfinx import fem
 from helpers import box, clamp, highest, linear, modulus
 
 import uem_dolfinx as uem
+from uem_dolfinx import compat
 from uem_dolfinx.contact import joining
 from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.pair.member import Member
 from uem_dolfinx.solve import problem as problems
-from uem_dolfinx.solve.steps.parted import part_contacts
 
 CALLS = ("Allreduce", "allreduce", "Allgather", "allgather", "Alltoall", "Alltoallv", "bcast")
 
@@ -202,7 +202,7 @@ def test_a_message_names_the_contact(caplog):
 
 
 def test_derivatives_are_of_each(monkeypatch):
-    """A gradient through steps is that of contacts that are treated alone; they are so from then on."""
+    """Derivatives through steps by the coefficient of one, and along its change, are those of contacts that are treated alone."""
     found = []
     for together in (True, False):
         if not together:
@@ -211,10 +211,65 @@ def test_derivatives_are_of_each(monkeypatch):
         with uem.recording(problem) as history:
             for _ in uem.load_steps(problem, 2):
                 pass
-        J = problem.u[0] ** 2 * ufl.dx
-        found.append(history.gradient(J, [uem.ContactParameter(contacts[1], "friction")])[0])
-        assert problem.interfaces == problem.pairs
-    assert np.abs(found[0] - found[1]).max() <= 1e-9 * np.abs(found[1]).max()
+        J, by_mu = problem.u[0] ** 2 * ufl.dx, uem.ContactParameter(contacts[1], "friction")
+        along = history.tangent([(by_mu, 1.0)])[-1]
+        other = uem.forms.assemble_scalar(fem.form(2.0 * problem.u[0] * along[0] * ufl.dx), COMM)
+        found.append([history.gradient(J, [by_mu])[0], other])
+        assert len(problem.interfaces) == (1 if together else 2)
+    assert np.abs(np.subtract(*found)).max() <= 1e-9 * np.abs(found[1]).max() and found[0][0] == pytest.approx(
+        found[0][1], rel=1e-9
+    )
+
+
+def parameters_of(contacts):
+    return [uem.ContactParameter(contact, name) for contact in contacts for name in ("place", "turn", "offset")]
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_derivatives_by_walls(mu, monkeypatch):
+    """Derivatives by places, turns and offsets of several surfaces are those of contacts alone; with friction through all steps."""
+    found = []
+    for together in (True, False):
+        if not together:
+            one_by_one(monkeypatch)
+        contacts, problem = between_walls(mu)
+        J = (problem.u[0] ** 2 + problem.u[1]) * ufl.dx
+        if mu:
+            with uem.recording(problem) as history:
+                for _ in uem.load_steps(problem, 2):
+                    pass
+            controls = [m for m in parameters_of(contacts) if m.parameter != "offset"]
+            slopes = history.gradient(J, controls)
+            along = history.tangent([(controls[0], np.array([0.3, 0.7]))])[-1]
+            work = uem.forms.assemble_scalar(fem.form(ufl.derivative(J, problem.u, along)), COMM)
+            assert work == pytest.approx(slopes[0] @ [0.3, 0.7], rel=1e-8)
+        else:
+            problem.solve()
+            slopes = uem.gradient(problem, J, parameters_of(contacts))
+        found.append(np.concatenate([np.ravel(one) for one in slopes]))
+    assert np.abs(found[0] - found[1]).max() <= 1e-9 * np.abs(found[1]).max() and np.abs(found[1]).max() > 1e-6
+
+
+def test_derivatives_of_a_pressure(monkeypatch):
+    """The pressure of one contact, by the offsets of two, backwards and forwards: as of contacts that are treated alone."""
+    found = []
+    for together in (True, False):
+        if not together:
+            one_by_one(monkeypatch)
+        contacts, problem = stacks(3)
+        contacts[2].offset = thicker = fem.Function(compat.function_space(problem.config.mesh, 1))
+        problem.solve()
+        p, offsets = contacts[1].pressure, [uem.ContactParameter(contact, "offset") for contact in contacts[:2]]
+        along = uem.tangent(problem, [(offsets[1], 1.0)], of=p)
+        slopes = uem.gradient(problem, p**2 * uem.ds(contacts[1].contactor), offsets)
+        work = uem.forms.assemble_scalar(fem.form(2.0 * p * along * uem.ds(contacts[1].contactor)), COMM)
+        assert work == pytest.approx(float(slopes[1]), rel=1e-9) and abs(slopes[0]) <= 1e-9 * abs(work)
+        by_field = uem.gradient(problem, problem.u[0] * ufl.dx, thicker)[0]
+        by_number = uem.gradient(problem, problem.u[0] * ufl.dx, uem.ContactParameter(contacts[2], "offset"))[0]
+        n = by_field.function_space.dofmap.index_map.size_local
+        assert COMM.allreduce(by_field.x.array[:n].sum()) == pytest.approx(float(by_number), rel=1e-9)
+        found.append([work, float(by_number)])
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.3])
@@ -251,7 +306,7 @@ def test_steps_that_switch_one(monkeypatch):
             problem, [uem.Step(n=2), uem.Step(contacts={contacts[1]: False}), uem.Step(contacts={contacts[1]: True})]
         ):
             forces.append([contact.resultant().force for contact in contacts])
-        assert len(problem.interfaces) == 3 and len(forces) >= 4
+        assert len(problem.interfaces) == (1 if together else 3) and len(forces) >= 4
         found.append((problem.u, np.array(forces)))
     (u, one), (v, other) = found
     close(u, v)
@@ -300,7 +355,7 @@ def test_friction_that_follows_a_temperature_is_not_joined():
     assert not joins(uem.OfTemperature(lambda x, t, T: 0.1 * T, field=1)) and not joins(uem.Tresca(1.0))
 
 
-def between_walls(mu):
+def between_walls(mu, moves=True):
     """A block that is pressed into a corner of two rigid walls, which turn and move, and that a ball reaches in the second half."""
     b = Bodies("quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [3, 3])])
     walls = [uem.RigidPlane((0, 0), (0, 1)), uem.RigidPlane((0, 0), (1, 0)), uem.RigidSphere((1.6, 0.5), 0.55)]
@@ -313,12 +368,14 @@ def between_walls(mu):
     every = surface_of(b.s, 0)
     contacts = [uem.Contact(every, wall, friction=mu, name=f"wall {k}") for k, wall in enumerate(walls)]
     bcs = clamp(b.V, b.side(0, 1, 1.0), 1, value=-0.03)
+    if not moves:
+        return contacts, b.problem(contacts, bcs + clamp(b.V, b.side(0, 0, 1.0), 0, value=-0.01))
     return contacts, b.problem(contacts, bcs, load=load)
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.3])
 def test_rigid_surfaces_that_move(mu, folder, monkeypatch):
-    """A corner of two walls and a ball, each of which moves: steps, a run that goes on, and one in which they part."""
+    """A corner of two walls and a ball, each of which moves: steps, and a run that goes on."""
     found = []
     for together in (True, False):
         if not together:
@@ -329,20 +386,43 @@ def test_rigid_surfaces_that_move(mu, folder, monkeypatch):
         uem.write_checkpoint(folder / f"walls {together}", problem.state())
         here = [told(contact) for contact in contacts]
         assert all(contact.n_active > 0 for contact in contacts)
-        part_contacts(problem)
-        problem.solve()
-        assert len(problem.interfaces) == 3
-        found.append((problem.u, steps, here, [told(contact) for contact in contacts]))
-    (u, n, here, later), (v, m, there, then) = found
+        found.append((problem.u, steps, here))
+    (u, n, here), (v, m, there) = found
     assert n == m
     close(u, v)
-    for one, other in zip(here + later, there + then):
+    for one, other in zip(here, there):
         alike(one, other)
     monkeypatch.undo()
     contacts, problem = between_walls(mu)
     uem.read_checkpoint(folder / "walls False", problem.state())
     for contact, other in zip(contacts, there):
         alike(told(contact), other)
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_walls_that_are_switched(mu, monkeypatch):
+    """A wall that is taken away under load, and put back: forces are those of contacts that are treated alone."""
+    found = []
+    for together in (True, False):
+        if not together:
+            one_by_one(monkeypatch)
+        contacts, problem = between_walls(mu, moves=False)
+        steps = [
+            uem.Step("press", 2),
+            uem.Step("away", 2, contacts={contacts[1]: False}),
+            uem.Step("back", contacts={contacts[1]: True}),
+        ]
+        forces = []
+        for step in uem.load_steps(problem, steps):
+            forces.append([contact.resultant().force for contact in contacts])
+        found.append((problem.u, np.array(forces), told(contacts[0])))
+        assert (
+            contacts[1].n_active and (np.array(forces)[3, 1] == 0.0).all() and len(problem.interfaces) == (1 if together else 3)
+        )
+    (u, one, here), (v, other, there) = found
+    close(u, v)
+    alike(here, there)
+    assert np.abs(one - other).max() <= 1e-10 * np.abs(other).max() and np.abs(one[0, 1]).max() > 1e-3
 
 
 def test_no_passage_through_one_of_several_surfaces():

@@ -21,6 +21,7 @@ from uem_dolfinx.accuracy.enriched import Enriched
 from uem_dolfinx.accuracy.enriched_curvature import Side, curvature
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pair.interface import table_of
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets, unit
 from uem_dolfinx.geometry.shapes import area_vectors, facet_shape
 from uem_dolfinx.parallel import gathered
@@ -101,17 +102,18 @@ class _Surface:
         self.facets = facets_of(config, contact.contactor, "contactor")
         self.dofs = self._dofs(contact.contactor)
         pair, nodes = contact.pair, enriched.nodes
-        friction = pair.friction
+        whole, rows = table_of(pair)
+        friction = whole.friction
         self.width = config.gdim if contact.tied or friction is not None else 1
         # active, stick, and mu s of contactors that slip, with their number
         state = np.zeros((config.n_owned, config.gdim + 3))
         state[pair.nodes, 0] = pair.tied if contact.tied else pair.trial.active
         state[:, 1] = contact.tied is not False
         if friction is not None:
-            slips = friction.slipping(pair.trial)
-            state[pair.nodes, 1] = friction.active(pair.trial) & ~slips
-            state[pair.nodes, 2] = slips
-            state[pair.nodes, 3:] = friction.value[:, None] * friction.directions(pair.trial)
+            slips = friction.slipping(whole.trial)
+            state[pair.nodes, 1] = (friction.active(whole.trial) & ~slips)[rows]
+            state[pair.nodes, 2] = slips[rows]
+            state[pair.nodes, 3:] = (friction.value[:, None] * friction.directions(whole.trial))[rows]
         of_facets = self._of_nodes(state)
         whole = of_facets[:, :, :2].min(axis=1, initial=1.0)
         #: Of each facet, a mean of mu s over the contactors that slip ``(m, gdim)``.

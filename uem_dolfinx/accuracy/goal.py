@@ -37,7 +37,6 @@ from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange, agreed, gathered, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps.parted import part_contacts
 
 #: Changes of the active set in the linear problem of a goal's error.
 #: [bound; factorisations; -]
@@ -133,8 +132,6 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
 def check_goal(problem: UnitedProblem, J: ufl.Form) -> None:
     """Refuse problems without an enriched linear problem, and functionals of more than the displacement (collective)."""
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
-    # the equations are those of single contacts
-    part_contacts(problem)
     with agreed(problem.comm):
         refuse_estimate(problem)
         given.kind("goal", J, isinstance(J, ufl.Form) and not J.empty(), "a UFL form with an integral, of the displacement")

@@ -11,7 +11,6 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.laws.thermal import OfTemperature
-from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -92,27 +91,9 @@ def join_alike(contacts: Sequence[Contact]) -> None:
         if len(alike) > 1:
             from uem_dolfinx.contact.pair.joined import JoinedInterface
 
-            whole = JoinedInterface([contact.pair for contact in alike])
-            for contact, member in zip(alike, whole.make_members()):
+            own = [contact.pair for contact in alike]
+            for contact, member in zip(alike, JoinedInterface(own).make_members(own)):
                 contact.take_pair(member)
-
-
-def part(contacts: Sequence[Contact]) -> list[tuple[Interface, list[Interface]]]:
-    """Separate joined contacts into their own interfaces again (collective).
-
-    Returns:
-        The joint interfaces, with the separate interfaces of each.
-    """
-    wholes = {id(contact.pair.whole): contact.pair.whole for contact in contacts}
-    parted = [(whole, whole.part()) for whole in wholes.values() if len(whole.members) > 1]
-    own = {id(member): pair for whole, pairs in parted for member, pair in zip(whole.members, pairs)}
-    for contact in contacts:
-        if id(contact.pair) in own:
-            contact.take_pair(own[id(contact.pair)])
-    for _, pairs in parted:
-        for pair in pairs:
-            pair.project()
-    return parted
 
 
 def _kind(contact: Contact) -> Hashable:

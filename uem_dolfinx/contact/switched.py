@@ -40,6 +40,16 @@ def switch_off(pair: Interface) -> None:
     settle(pair, state)
 
 
+def mark(contact: Contact, on: bool) -> None:
+    """Mark a contact as switched on or off, also among others in its interface (collective)."""
+    contact.switch(on)
+    whole = contact.pair.whole
+    if len(whole.members) > 1:
+        every = whole.discretisation.setting.on.copy()
+        every[whole.members.index(contact.pair)] = on
+        whole.discretisation.set(on=every)
+
+
 def switch_on(contact: Contact) -> None:
     """Start a contact in the current configuration, as at the start of a problem (collective).
 

@@ -30,6 +30,10 @@ class JoinedMotion:
         """See ``Motion`` ``(n, gdim)``."""
         return self._moved("back", x)
 
+    def turn(self, v: Array) -> Array:
+        """See ``Motion`` ``(n, gdim)``."""
+        return self._moved("turn", v)
+
     def since(self, before: JoinedMotion, part: float) -> JoinedMotion:
         """See ``Motion``; of each surface."""
 

@@ -34,6 +34,10 @@ class Motion:
         """Reference positions of points that are now at ``x (n, gdim)``."""
         return (x - self.about - self.translation) @ self.Q + self.about
 
+    def turn(self, v: Array) -> Array:
+        """Vectors of the reference position, turned ``(n, gdim)``."""
+        return v @ self.Q.T
+
     def since(self, before: Motion, part: float) -> Motion:
         """The last ``part`` of the motion since ``before``: of the displacement of ``about`` and of the rotation."""
         there = before.carry(self.about[None])[0]

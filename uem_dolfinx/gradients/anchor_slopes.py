@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, name_at
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError
@@ -34,7 +34,6 @@ class AnchorSlopes:
 
     Args:
         pair: the interface, in the trial state of the step.
-        name: of its contact, for messages.
 
     Attributes:
         stuck: mask of contactors at their anchors ``(n,)``.
@@ -43,9 +42,9 @@ class AnchorSlopes:
         InputError: for contactors held by corners or edges of the target, or with zero slip, whose direction is undefined.
     """
 
-    def __init__(self, pair: Interface, name: str):
+    def __init__(self, pair: Interface):
         assert pair.friction is not None
-        self._pair, self._sliding, self._name = pair, pair.friction, name
+        self._pair, self._sliding = pair, pair.friction
         self._config, state = pair.config, pair.trial
         active = self._sliding.active(state)
         assert state.friction is not None
@@ -62,9 +61,11 @@ class AnchorSlopes:
     def _refuse(self, which: Bools, words: str) -> None:
         count = int(reduced(self._config.comm, int(which.sum())))
         if count:
+            names = self._config.comm.allgather([name_at(self._pair, i) for i in np.flatnonzero(which)[:1]])
+            name = next(filter(None, names))[0]
             raise InputError(
-                f"contact '{self._name}': a {words} {count} contactor(s), through which histories have no derivatives; take another mesh, "
-                "other steps, or differences of two solutions"
+                f"contact '{name}': a {words} {count} contactor(s), through which histories have no derivatives; take another mesh, other "
+                "steps, or differences of two solutions"
             )
 
     def _turn_by_slip(self) -> None:
@@ -77,24 +78,27 @@ class AnchorSlopes:
         q = c[:, None] * w - self._sliding.frame.tangential(state.friction.tau)
         self._sliding.pivot = replace(self._sliding.pivot, stiffness=c, q=q)
 
-    def leaning(self) -> list[tuple[Ints, Array]]:
-        """Terms that Newton's tangent neglects in 3D, lists of global nodes and blocks as in ``Interface.curvature``.
+    def turned(self, state: PairState) -> list[tuple[Ints, Array]]:
+        """Terms of slip with the forces of a state, lists of global nodes and blocks as in ``Interface.curvature`` (collective).
 
-        On a curved surface an offset w is inclined to the tangent plane, so that its part in that plane changes by ``- (n . w) n'``.
+        In 3D, directions turn. On a curved surface an offset w is inclined to the tangent plane, so that its part in that plane changes
+        by ``- (n . w) n'``, which Newton's tangent neglects.
         """
         if self._config.gdim == 2:
             return []
-        i, p, kinematics = np.flatnonzero(self._slips), self._pair.kinematics.projection, self._pair.kinematics
-        _, _, stiffness = self._sliding.turning(self._pair.trial, kinematics)
+        kinematics = self._pair.kinematics
+        i, p = np.flatnonzero(self._sliding.slipping(state)), kinematics.projection
+        _, _, stiffness = self._sliding.turning(state, kinematics)
         lean = np.einsum("ng,ng->n", kinematics.normal, self._sliding.frame.away)[i]
         turned = -lean[:, None, None] * np.einsum("kgh,khi->kgi", stiffness, p.normal_slopes(i))
         share = np.column_stack([np.ones(len(i)), -p.weights[i]])
         blocks = np.einsum("ka,kgi->kagi", share, turned).reshape(len(i), turned.shape[2], turned.shape[2])
-        return [(np.column_stack([self._config.to_global(self._pair.nodes[i]), p.nodes[i]]), blocks)]
+        leaning = np.column_stack([self._config.to_global(self._pair.nodes[i]), p.nodes[i]]), blocks
+        return [leaning, *(terms[:2] for terms in [self._sliding.slip_terms(state, kinematics)] if terms is not None)]
 
-    def without_stuck(self) -> PairState:
+    def without_stuck(self, state: PairState) -> PairState:
         """The state with zero forces of contactors at their anchors, since their equations do not rotate."""
-        return replace(self._pair.trial, nodal=np.where(self.stuck, 0.0, self._pair.trial.nodal))
+        return replace(state, nodal=np.where(self.stuck, 0.0, state.nodal))
 
     def _tangents_at_anchors(self) -> Array:
         """Derivatives of the anchors ``(n, k, gdim)`` by their coordinates (collective)."""
@@ -103,8 +107,8 @@ class AnchorSlopes:
         if isinstance(target, MeshTarget):
             own = target.facets.current()
             return np.einsum("naf,nag->nfg", target.shape.tabulate(f.xi).dN, target.of_facets(f.facet, own.x))
-        turn = np.eye(self._config.gdim) if target.motion is None else target.motion.Q.T
-        return np.broadcast_to(turn, (len(f.stick), *turn.shape))
+        along = np.broadcast_to(np.eye(self._config.gdim)[:, None], (self._config.gdim, *f.anchor.shape))
+        return np.stack([e if target.motion is None else target.motion.turn(e) for e in along], axis=1)
 
     @property
     def size(self) -> int:
@@ -216,12 +220,13 @@ class AnchorSlopes:
             own = own - config.add_at_owners(*self._sliding.frame.ties.handed_on(turned))
         return gaps, own
 
-    def follow(self, moved: Array, way: Array, first: bool) -> Array:
+    def follow(self, moved: Array, way: Array, led: Array, first: bool) -> Array:
         """Changes of the anchors ``(n, k)`` at the end of the step, NaN where they have no derivative: the transpose of ``back``.
 
         Args:
             moved: changes of the initial anchors ``(n, k)``.
-            way: changes of the positions of the owned nodes, of contactors relative to a rigid target ``(n_owned, gdim)``.
+            way: changes of the positions of the owned nodes ``(n_owned, gdim)``.
+            led: changes of the positions of rigid targets below contactors ``(n, gdim)``.
             first: see ``back``.
         """
         pair, loose = self._pair, self._loose(first)
@@ -236,5 +241,5 @@ class AnchorSlopes:
             if self._config.gdim == 3:
                 found[i[~free.all(axis=1)]] = np.nan
         else:
-            found[i] = np.einsum("nkg,ng->nk", self._anchor[i], self._below(p, i, way[pair.nodes[i]], False))
+            found[i] = np.einsum("nkg,ng->nk", self._anchor[i], self._below(p, i, way[pair.nodes[i]] - led[i], False))
         return found

@@ -13,6 +13,7 @@ from dolfinx import fem
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.ties.preloaded import Preloaded
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -31,10 +32,9 @@ def constants_of_law(contact: Contact) -> list[fem.Constant]:
     return [] if contact.normal is None else contact.normal.constants
 
 
-def section_of(contact: Contact) -> Preloaded | None:
+def section_of(pair: Interface) -> Preloaded | None:
     """The tie of a preloaded section; None for other contacts."""
-    tie = contact.pair.tie
-    return tie if isinstance(tie, Preloaded) else None
+    return pair.tie if isinstance(pair.tie, Preloaded) else None
 
 
 class Users:
@@ -138,4 +138,4 @@ def _rigid(couplings: Sequence[Any]) -> list[Any]:
 
 
 def _sections(problem: UnitedProblem) -> list[Preloaded]:
-    return [section for section in map(section_of, problem.contacts) if section is not None]
+    return [section for section in map(section_of, problem.interfaces) if section is not None]

@@ -11,8 +11,9 @@ from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.nodes.bernstein import Bernstein
+from uem_dolfinx.contact.pair.interface import table_of
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.gradients.parameters import keeps_distance, rubbed, rubbed_along, thickened
+from uem_dolfinx.gradients.parameters import contactors_of, keeps_distance, rubbed, rubbed_along, thickened
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -54,36 +55,41 @@ def by_contacts(at: Any, m: fem.Function, by_gaps: Array, a: Array) -> tuple[Int
         Local degrees of freedom of m, and their derivatives, both ``(k,)``.
     """
     entries, found = [np.zeros(0, np.int64)], [np.zeros(0)]
-    for k, contact in enumerate(at.problem.contacts):
-        for own, values in _slopes(at, k, contact, m, by_gaps, a):
+    for contact in at.problem.contacts:
+        for own, values in _slopes(at, contact, m, by_gaps, a):
             entries.append(_entries(at, m, contact)[own])
             found.append(values)
     return np.concatenate(entries), np.concatenate(found)
 
 
-def _slopes(at: Any, k: int, contact: Contact, m: fem.Function, by_gaps: Array, a: Array) -> list[tuple[Ints, Array]]:
+def _slopes(at: Any, contact: Contact, m: fem.Function, by_gaps: Array, a: Array) -> list[tuple[Ints, Array]]:
     """Contactors of one contact, and derivatives by their values."""
     found: list[tuple[Ints, Array]] = []
     if as_law(contact.friction).field is m and contact.pair.friction is not None:
         found.append((np.arange(len(contact.pair.nodes)), -rubbed_along(contact.pair, a)))
     if contact.offset is m:
-        which = at.equations_of(k, "its offset")
+        own, which = at.equations_of(contact, "its offset")
         opened, worked = thickened(contact.pair, at.multipliers[which], a)
-        found.append((at.equations[k].contactor, by_gaps[which] * opened - worked))
+        mine, (_, rows) = contactors_of(own, contact.pair), table_of(contact.pair)
+        found.append((own.contactor[mine] - rows.start, (by_gaps[which] * opened - worked)[mine]))
     return found
 
 
 def along_field(at: Any, m: fem.Function, change: Array) -> tuple[Array, Array]:
     """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` along changes of a Function's local values (collective)."""
     gaps, pushed = np.zeros_like(at.multipliers), np.zeros((at.config.n_owned, at.config.gdim))
-    for k, contact in enumerate(at.problem.contacts):
+    for contact in at.problem.contacts:
         if as_law(contact.friction).field is m and contact.pair.friction is not None:
             pushed = pushed + rubbed(contact.pair, change[_entries(at, m, contact)])
         if contact.offset is m:
-            which = at.equations_of(k, "its offset")
-            more = change[_entries(at, m, contact)[at.equations[k].contactor]]
+            own, which = at.equations_of(contact, "its offset")
+            whole, rows = table_of(contact.pair)
+            more = np.zeros(len(whole.nodes))
+            more[rows] = change[_entries(at, m, contact)]
+            more = more[own.contactor]
             opened, forces = thickened(contact.pair, at.multipliers[which] * more)
-            gaps[which], pushed = opened * more, pushed + forces
+            gaps[which] += opened * more
+            pushed = pushed + forces
     return gaps, pushed
 
 

@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pair.interface import Interface, table_of
 from uem_dolfinx.dynamics.rate_slopes import RateChanges
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
@@ -88,8 +88,8 @@ class Forward:
     def __init__(self, problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]]):
         self.problem, self._direction, self.found = problem, direction, list[fem.Function]()
         self._derivatives = Derivatives(problem.bodies.F, problem.u.function_space, problem.config.V)
-        self._anchors = [np.zeros((0, 0))] * len(problem.pairs)
-        self._sections = [section_of(contact) for contact in problem.contacts]
+        self._anchors = [np.zeros((0, 0))] * len(problem.interfaces)
+        self._sections = [section_of(pair) for pair in problem.interfaces]
         self._openings = [0.0] * len(self._sections)
         self._rates = None if problem.dynamics is None else RateChanges(problem.dynamics, self._density())
         laws: list[Any] = problem.materials
@@ -120,7 +120,7 @@ class Forward:
             elif isinstance(m, fem.Function):
                 forces += forces_along(problem, m, change)
                 velocity += change.x.array[:n] if m is dynamics.start_velocity else 0.0
-            elif isinstance(m, ContactParameter) and (section := section_of(m.contact)) is not None:
+            elif isinstance(m, ContactParameter) and (section := section_of(m.contact.pair)) is not None:
                 forces += float(change) * by_section(section, m.parameter, 0)[1].ravel()
         forces += damping_along(problem, velocity)
         acceleration = np.where(dynamics.massy.ravel(), -accelerations(problem, forces).array_r[:n], 0.0)
@@ -129,7 +129,7 @@ class Forward:
     def begin(self, first: Record) -> None:
         """Compute changes of the anchors before the first step (collective)."""
         problem = self.problem
-        if not any(pair.friction is not None for pair in problem.pairs):
+        if not any(pair.friction is not None for pair in problem.interfaces):
             return
         Memory.put_back(first.before, problem)
         places, shape = Places(problem.config), np.zeros((problem.config.n_owned, problem.config.gdim))
@@ -138,7 +138,7 @@ class Forward:
                 shape += self._at_nodes(places.at_nodes(change))
         slopes = anchor_slopes_of(problem)
         self._anchors = [
-            np.zeros((0, 0)) if at is None else np.zeros((len(p.nodes), at.size)) for at, p in zip(slopes, problem.pairs)
+            np.zeros((0, 0)) if at is None else np.zeros((len(p.nodes), at.size)) for at, p in zip(slopes, problem.interfaces)
         ]
         self._follow(slopes, shape, True)
 
@@ -186,17 +186,18 @@ class Forward:
 
     def _follow(self, slopes: Sequence[AnchorSlopes | None], way: Array, first: bool) -> None:
         """Compute changes of the anchors, with those of the owned nodes ``way (n_owned, gdim)`` (collective)."""
-        for k, (at, contact) in enumerate(zip(slopes, self.problem.contacts)):
+        for k, (at, pair) in enumerate(zip(slopes, self.problem.interfaces)):
             if at is not None:
-                self._anchors[k] = at.follow(self._anchors[k], way - self._led(contact, len(way)), first)
+                self._anchors[k] = at.follow(self._anchors[k], way, self._led(pair), first)
 
-    def _led(self, contact: Contact, n: int) -> Array | float:
-        """Changes of the positions of nodes on the rigid target of a contact ``(n, gdim)``."""
-        found: Array | float = 0.0
+    def _led(self, pair: Interface) -> Array:
+        """Changes of the positions of rigid targets below contactors ``(n, gdim)``."""
+        found = np.zeros(pair.points.shape)
         for m, change in self._direction:
-            if isinstance(m, ContactParameter) and m.contact is contact and m.parameter in ("place", "turn"):
-                for entry, size in np.ndenumerate(np.asarray(change, dtype=float)):
-                    found = found + size * motion_of(m, self.problem.config.x[:n], entry)
+            if isinstance(m, ContactParameter) and m.parameter in ("place", "turn"):
+                whole, rows = table_of(m.contact.pair)
+                for entry, size in np.ndenumerate(np.asarray(change, dtype=float)) if whole is pair else ():
+                    found[rows] += size * motion_of(m, pair.points[rows], entry)
         return found
 
     def _at_nodes(self, f: fem.Function) -> Array:

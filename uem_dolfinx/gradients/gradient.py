@@ -218,10 +218,6 @@ def check_problem(problem: UnitedProblem, recorded: bool = True) -> None:
             raise InputError(
                 "gradients at an offset need a rigid plane, sphere or cylinder: gaps from other surfaces are distances on these alone"
             )
-    from uem_dolfinx.solve.steps.parted import part_contacts
-
-    # derivatives are implemented for single contacts
-    part_contacts(problem)
 
 
 def refuse_kept_projections(problem: UnitedProblem, steps: int) -> None:

@@ -135,10 +135,10 @@ class History(given.Sealed):
         return Record(
             before=before,
             displacement=np.array(problem.u.x.array),
-            states=[pair.trial for pair in problem.pairs],
+            states=[pair.trial for pair in problem.interfaces],
             motions=problem.rigid_motions(),
             values=[np.array(forms.values_of(m)) for m in self._inputs],
-            friction=[None if pair.friction is None else pair.friction.value for pair in problem.pairs],
+            friction=[_friction_of(pair) for pair in problem.interfaces],
             offsets=[pair.discretisation.setting.offset for pair in problem.pairs],
             shares=shares,
             held=held,
@@ -237,7 +237,10 @@ class History(given.Sealed):
         """Let recorded steps take the place of the problem's present state for a while (collective)."""
         problem = self.problem
         now, displacement = Memory.of(problem), np.array(problem.u.x.array)
-        values, friction = [np.array(forms.values_of(m)) for m in self._inputs], [_friction_of(pair) for pair in problem.pairs]
+        values, friction = (
+            [np.array(forms.values_of(m)) for m in self._inputs],
+            [_friction_of(pair) for pair in problem.interfaces],
+        )
         offsets, prescribed = [pair.discretisation.setting.offset for pair in problem.pairs], Prescribed.of(problem)
         try:
             yield
@@ -347,12 +350,13 @@ class History(given.Sealed):
         """Set the values of Constants and Functions, friction and offsets of the problem (collective)."""
         for m, value in zip(self._inputs, values):
             forms.values_of(m)[...] = value
-        for pair, mu, offset in zip(self.problem.pairs, friction, offsets):
+        for pair, mu in zip(self.problem.interfaces, friction):
             if pair.friction is not None and mu is not None:
                 pair.discretisation.set(cones=pair.friction.limits.change(mu))
+        for pair, offset in zip(self.problem.pairs, offsets):
             there = pair.discretisation.setting.offset
             if there is not offset and (there is None or offset is None or not np.array_equal(there, offset)):
-                pair.discretisation.set(offset=offset)
+                pair.set_offset(offset)
 
     def _place(self, record: Record) -> None:
         """Set the problem to the end of a recorded step, before its commit (collective)."""
@@ -362,7 +366,7 @@ class History(given.Sealed):
         record.before.put_back(problem)
         problem.u.x.array[:] = record.displacement
         move_targets(problem, record.motions)
-        for pair, state in zip(problem.pairs, record.states):
+        for pair, state in zip(problem.interfaces, record.states):
             pair.trial = state
         if problem.dynamics is not None and record is not self._start:
             problem.dynamics.begin(record.dt)

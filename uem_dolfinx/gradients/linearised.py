@@ -43,13 +43,22 @@ from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.pair.interface import in_question
+from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.contact_fields import along_field
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
-from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of, rubbed, thickened, turned_by
+from uem_dolfinx.gradients.parameters import (
+    ContactParameter,
+    acting,
+    contactors_of,
+    led_for,
+    motion_of,
+    rubbed,
+    thickened,
+    turned_by,
+)
 from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
 from uem_dolfinx.gradients.refused import refuse_sharp
@@ -103,7 +112,7 @@ class Linearised:
         F: the residual in UFL.
         derivatives: of F and of functionals.
         P: restriction matrix of the active contactors.
-        rows: their equations; ``equations`` lists the equations of each contact.
+        rows: their equations; ``equations`` lists the equations of each of the problem's ``interfaces``.
         multipliers: of all equations of contacts, and of users ``(m,)``.
         ramp: shares of the Dirichlet values, see ``solve.taken``, in the rows of vectors ``(n_rows, gdim)``.
     """
@@ -157,7 +166,7 @@ class Linearised:
         bodies.assemble()
         state = system.assemble_constraints(lambda norm, scale, rounding: True)
         assert isinstance(state, BodyState)
-        self.P, self.rows, self.equations = state.trial, state.rows, state.rows.of(self.problem.pairs)
+        self.P, self.rows, self.equations = state.trial, state.rows, state.rows.of(self.problem.interfaces)
         for contact in self.problem.contacts:
             refuse_sharp(contact)
         self.multipliers = state.test.multipliers(state.test.pass_on(system.residual()))
@@ -209,21 +218,22 @@ class Linearised:
         Raises:
             InputError: if they do not exist.
         """
-        if self.rows.independent is not None and self.rows.independent.found:
+        if self.rows.conflict:
             raise InputError(
                 f"contact '{contact.name}': equations of contactors conflict with each other or with Dirichlet conditions, and have been "
                 "replaced by others, so that pressures have no derivatives here; let nodes be contactors of one contact, with free normals"
             )
-        return PressureSlopes(contact, self.equations[self.problem.contacts.index(contact)])
+        return PressureSlopes(contact, self.equations_of(contact)[0])
 
     def lift(self, weights: dict[Contact, Array]) -> PETSc.Vec:
-        """``S L w`` for weights of the multipliers of some contacts' equations ``(m,)`` each (collective with weights)."""
+        """``S L w`` for weights of the multipliers of the equations of some contacts' interfaces (collective with weights)."""
         if not weights:
             # rows that replace conflicting equations may be on other ranks
             return self.config.vector()
-        parts = [weights.get(c, np.zeros(len(own))) for c, own in zip(self.problem.contacts, self.equations)]
-        users = np.zeros(len(self.multipliers) - sum(len(part) for part in parts))
-        return self.P.read_back(np.concatenate([*parts, users]))
+        w = np.zeros(len(self.multipliers))
+        for contact, own in weights.items():
+            w[self.equations_of(contact)[1]] += own
+        return self.P.read_back(w)
 
     def vector(self, at_nodes: npt.ArrayLike = 0.0) -> PETSc.Vec:
         """A vector with values at the displacement's owned nodes ``(n_owned, gdim)``, zero in other fields."""
@@ -249,15 +259,15 @@ class Linearised:
         out.array[: self._n] = self.problem.system.floating.without_open_motions(np.array(v.array_r[: self._n]))
         return out
 
-    def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
-        """Derivative of the forces of contacts with these numbers with the displacement, with the opposite sign (collective)."""
-        pairs, like = in_question([self.problem.pairs[k] for k in which]), self.config.unknowns.vector()
-        return together(curvature_of(pairs, like, True, False), self.stiffness_of_gaps(which))
+    def stiffness_of(self, contact: Contact | None = None) -> PETSc.Mat | None:
+        """Derivative of the forces of a contact, or of all, by the displacement, with the opposite sign (collective)."""
+        pairs, like = acting(self.problem, contact), self.config.unknowns.vector()
+        curvature = curvature_of([pair for pair, _ in pairs], like, True, False, states=[state for _, state in pairs])
+        return together(curvature, self.stiffness_of_gaps(pairs))
 
-    def stiffness_of_gaps(self, which: Sequence[int]) -> PETSc.Mat | None:
-        """Stiffness of the gaps of soft contacts with these numbers (collective)."""
-        pairs = [pair for pair in in_question([self.problem.pairs[k] for k in which]) if pair.trial.has_law]
-        return slip_terms(pairs, self.config.unknowns.vector())[0]
+    def stiffness_of_gaps(self, pairs: Sequence[tuple[Any, ...]]) -> PETSc.Mat | None:
+        """Stiffness of the gaps of soft contacts (collective)."""
+        return slip_terms([pair for pair, *_ in pairs if pair.trial.has_law], self.config.unknowns.vector())[0]
 
     @property
     def _turns_back(self) -> bool:
@@ -294,36 +304,39 @@ class Linearised:
         Returns:
             Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
         """
-        k, pair, config = self.problem.contacts.index(m.contact), m.contact.pair, self.config
+        pair, config = m.contact.pair, self.config
         gaps = np.zeros_like(self.multipliers)
         if m.parameter == "friction":
             return gaps, rubbed(pair)
-        own, rows = self.equations_of(k, f"its {m.parameter}"), self.equations[k].P
-        if (section := section_of(m.contact)) is not None:
-            gaps[own], pushed = by_section(section, m.parameter, len(self.equations[k]))
+        own, which = self.equations_of(m.contact, f"its {m.parameter}")
+        if (section := section_of(pair)) is not None:
+            gaps[which], pushed = by_section(section, m.parameter, len(own))
             return gaps, pushed
         if m.parameter == "offset":
-            gaps[own], forces = thickened(pair, self.multipliers[own])
+            gaps[which], forces = thickened(pair, self.multipliers[which])
             return gaps, forces
-        b, pushed = motion_of(m, config.x[: config.n_owned], entry), np.zeros((config.n_owned, config.gdim))
+        rows, b, pushed = own.P, motion_of(m, config.x[: config.n_owned], entry), np.zeros((config.n_owned, config.gdim))
         there = np.einsum("kg,kg->k", rows.coefficients, config.ask_owners(rows.followed, b))
-        gaps[own] = np.bincount(rows.row, there, len(rows)) - np.einsum("mg,mg->m", rows.direction, b[rows.node])
+        opened = np.bincount(rows.row, there, len(rows)) - np.einsum("mg,mg->m", rows.direction, b[rows.node])
+        gaps[which] = np.where(contactors_of(own, pair), opened, 0.0)
         if m.parameter == "turn":
             nodes, force = pair.nodal_forces(pair.trial)
             pushed = config.add_at_owners(nodes, turned_by(entry, force))
-        if (stiffness := self.stiffness_of([k])) is not None:
+        if (stiffness := self.stiffness_of(m.contact)) is not None:
             pushed = pushed + forms.product(stiffness, self.vector(b)).array_r[: self._n].reshape(-1, config.gdim)
         return gaps, -pushed
 
-    def equations_of(self, k: int, what: str) -> slice:
-        """Place of a contact's equations among all, if there are derivatives by ``what`` changes their gaps (to be agreed on)."""
-        self._refuse_replaced(f"contact '{self.problem.contacts[k].name}'", what)
+    def equations_of(self, contact: Contact, what: str = "") -> tuple[ContactRows, slice]:
+        """Equations of a contact's interface, and their place among all; refused if ``what`` has no derivatives (to be agreed on)."""
+        if what:
+            self._refuse_replaced(f"contact '{contact.name}'", what)
+        k = self.problem.interfaces.index(contact.pair.whole)
         first = sum(len(own) for own in self.equations[:k])
-        return slice(first, first + len(self.equations[k]))
+        return self.equations[k], slice(first, first + len(self.equations[k]))
 
     def _refuse_replaced(self, whose: str, what: str) -> None:
         """Refuse derivatives by gaps if equations have been replaced by others."""
-        if self.P.rings is not None or (self.rows.independent is not None and self.rows.independent.found):
+        if self.P.rings is not None or self.rows.conflict:
             raise InputError(
                 f"{whose}: equations follow each other in rings, or conflict, so that {what} has no derivative here; let nodes be "
                 "contactors of one contact, with free normals"
@@ -416,12 +429,10 @@ class Linearised:
 
     def pressed(self, contact: Contact, motion: Motion) -> fem.Function:
         """Change of a contact's pressure with a motion (collective)."""
-        slopes, k = self.pressures(contact), self.problem.contacts.index(contact)
+        slopes, (_, which) = self.pressures(contact), self.equations_of(contact)
         multipliers = self.P.multipliers(self.P.pass_on(motion.reactions))
-        ends = np.cumsum([len(own) for own in self.equations])
         found = fem.Function(contact.pressure.function_space)
-        part = multipliers[ends[k] - len(self.equations[k]) : ends[k]]
-        found.x.array[contact.nodes] = slopes.along(part, motion.du, motion.shape)
+        found.x.array[contact.nodes] = slopes.along(multipliers[which], motion.du, motion.shape)
         found.x.scatter_forward()
         return found
 

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mpi4py import MPI
 
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.conditions.rigid_set import turned
 from uem_dolfinx.conditions.united_rows import forces_of
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.friction.sliding import Sliding
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.mortar.placement import MortarKinematics
-from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.interface import Interface, in_question, table_of
 from uem_dolfinx.contact.preload import Preload
+from uem_dolfinx.contact.seam.placement import ContactRows
+from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Offsets that differ by this part of a facet's side leave the same terms in rows of weighted gaps, which are linear in them.
 #: [bound; side of a facet; -]
@@ -83,23 +86,43 @@ def turned_by(entry: tuple[int, ...], v: Array) -> Array:
     return turned(np.eye(3)[entry[0]] if entry else np.ones(1), v)
 
 
-def thickened(pair: Interface, multipliers: Array, along: Array | None = None) -> tuple[Array, Array]:
-    """Derivatives of gaps ``(m,)`` and residual ``(n_owned, gdim)`` by the offset, in which both are linear (collective).
+def acting(problem: UnitedProblem, contact: Contact | None) -> list[tuple[Interface, PairState]]:
+    """Interfaces near their targets, with the forces of a contact, or of all."""
+    if contact is None:
+        return [(pair, pair.trial) for pair in in_question(problem.interfaces)]
+    whole, rows = table_of(contact.pair)
+    own, t = np.zeros(len(whole.nodes), dtype=bool), whole.trial
+    own[rows] = True
+    force = np.where(own[:, None], t.force, 0.0)
+    state = replace(t, active=t.active & own, lam=t.lam * own, nodal=t.nodal * own, force=force)
+    return [(pair, state) for pair in in_question([whole])]
 
-    ``along``: displacements of the owned nodes ``(n_owned, gdim)``, for the work of the residual of each equation instead ``(m,)``.
+
+def contactors_of(rows: ContactRows, pair: Interface) -> Bools:
+    """Which rows of the interface in use are of a contact's contactors ``(m,)``."""
+    _, own = table_of(pair)
+    return np.asarray((rows.contactor >= own.start) & (rows.contactor < own.stop))
+
+
+def thickened(pair: Interface, multipliers: Array, along: Array | None = None) -> tuple[Array, Array]:
+    """Derivatives of gaps ``(m,)`` and residual ``(n_owned, gdim)`` by a contact's offset, in which both are linear (collective).
+
+    Args:
+        pair: of the contact.
+        multipliers: of the equations of the interface in use ``(m,)``.
+        along: displacements of the owned nodes ``(n_owned, gdim)``, for the work of the residual of each equation instead ``(m,)``.
     """
-    d, kinematics = pair.discretisation, pair.kinematics
     more = THICKER * float(reduced(pair.config.comm, _least_side(pair), op=MPI.MIN))
-    before, length = d.setting.offset, pair.kinematics.gap_rows.scale
+    before, length = pair.discretisation.setting.offset, pair.whole.kinematics.gap_rows.scale
     try:
         gap, forces = _gaps_and_forces(pair, multipliers, length, along)
-        d.set(offset=np.full(len(pair.nodes), more) + (0.0 if before is None else before))
+        pair.set_offset(np.full(len(pair.nodes), more) + (0.0 if before is None else before))
         pair.project()
         other_gap, other_forces = _gaps_and_forces(pair, multipliers, length, along)
     finally:
-        d.set(offset=before)
-        pair.kinematics = kinematics
-    return (other_gap - gap) / more, (forces - other_forces) / more
+        pair.set_offset(before)
+        pair.project()
+    return np.where(contactors_of(pair.whole.equations(), pair), other_gap - gap, 0.0) / more, (forces - other_forces) / more
 
 
 def _least_side(pair: Interface) -> float:
@@ -112,10 +135,13 @@ def _least_side(pair: Interface) -> float:
 
 def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array, along: Array | None) -> tuple[Array, Array]:
     """Gaps of equations ``(m,)`` and contact forces, or their work, see ``thickened``, scaled to another ``length (n,)`` (collective)."""
-    if isinstance(pair.discretisation, Mortar) and isinstance(pair.kinematics, MortarKinematics):
-        pair.kinematics = pair.discretisation.with_variation(pair.kinematics)
-    own, config = pair.equations(), pair.config
-    longer = (pair.kinematics.gap_rows.scale / length)[own.contactor]
+    whole, config = pair.whole, pair.config
+    own, rows = whole.equations(), whole.kinematics.gap_rows
+    if isinstance(pair.discretisation, Mortar) and isinstance(whole.kinematics, MortarKinematics):
+        rows = pair.discretisation.with_variation(whole.kinematics).gap_rows
+        own = rows.select(np.flatnonzero(whole.trial.reserved), whole.trial.active)
+    multipliers = np.where(contactors_of(own, pair), multipliers, 0.0)
+    longer = (rows.scale / length)[own.contactor]
     if along is None:
         return own.P.gap * longer, forces_of(config, own.Q, multipliers * longer)
     forces, there = own.Q.forces(multipliers * longer), config.ask_owners(own.Q.followed, along)
@@ -126,25 +152,29 @@ def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array, along: 
 
 def rubbed(pair: Interface, change: Array | None = None) -> Array:
     """Derivative of the residual by the coefficient of friction, or along its ``change (n,)``: ``(n_owned, gdim)`` (collective)."""
-    nodes, forces = _sliding(pair).frame.ties.handed_on(_rubbed(pair) * (1.0 if change is None else change[:, None]))
-    return pair.config.add_at_owners(nodes, forces)
+    (whole, rows), found = table_of(pair), _rubbed(pair)
+    found[rows] *= 1.0 if change is None else change[:, None]
+    return pair.config.add_at_owners(*_sliding(whole).frame.ties.handed_on(found))
 
 
 def rubbed_along(pair: Interface, a: Array) -> Array:
     """Work of the residual's derivative by the coefficient at each contactor along ``a (n_owned, gdim)``: ``(n,)`` (collective)."""
-    return np.einsum("ng,ng->n", _rubbed(pair), _sliding(pair).frame.ties.relative(a))
+    whole, rows = table_of(pair)
+    return np.einsum("ng,ng->n", _rubbed(pair), _sliding(whole).frame.ties.relative(a))[rows]
 
 
 def _rubbed(pair: Interface) -> Array:
-    """Derivatives of tangential multipliers by the coefficient ``(n, gdim)`` (collective)."""
-    sliding = _sliding(pair)
-    if reduced(pair.config.comm, bool((sliding.value == 0.0).any()), op=MPI.LOR):
+    """Derivatives of tangential multipliers of the interface in use by a contact's coefficient ``(n, gdim)`` (collective)."""
+    whole, rows = table_of(pair)
+    sliding, state, found = _sliding(whole), whole.trial, np.zeros(whole.points.shape)
+    if reduced(pair.config.comm, bool((sliding.value[rows] == 0.0).any()), op=MPI.LOR):
         raise InputError(
             f"{pair.name}: some contactors have no friction in a step, where the coefficient has a one-sided derivative: expected a "
             "positive coefficient everywhere"
         )
-    share = sliding.slipping(pair.trial) * pair.trial.lam / pair.kinematics.ties.share
-    return np.asarray(share[:, None] * sliding.directions(pair.trial))
+    share = sliding.slipping(state) * state.lam / whole.kinematics.ties.share
+    found[rows] = (share[:, None] * sliding.directions(state))[rows]
+    return found
 
 
 def _sliding(pair: Interface) -> Sliding:

@@ -19,6 +19,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pair.interface import table_of
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced
@@ -28,7 +29,7 @@ class PressureWeights(NamedTuple):
     """Derivative of ``sum w_i p_i``.
 
     Attributes:
-        multipliers: by the multipliers of the pair's equations ``(m,)``.
+        multipliers: by the multipliers of the equations ``(m,)``.
         areas: functional whose derivatives by displacement and shape are the derivatives through the areas; None for points.
         now: by the present positions of the owned nodes ``(n_owned, gdim)``, at fixed forces and ``areas``.
         drawn: by the reference positions of the owned nodes ``(n_owned, gdim)``, at fixed present positions.
@@ -45,7 +46,7 @@ class PressureSlopes:
 
     Args:
         contact: of a problem.
-        equations: of its pair, in the present state.
+        equations: of its interface in use, in the present state.
 
     Raises:
         InputError: if further parts touch, or a concave corner holds contactors, whose pressures come from several facets with
@@ -54,6 +55,7 @@ class PressureSlopes:
 
     def __init__(self, contact: Contact, equations: ContactRows):
         self.contact, self._pair, self._equations = contact, contact.pair, equations
+        self._whole, self._rows = table_of(contact.pair)
         self._config, self._current = contact.config, contact.measure == "current"
         if contact.further_parts_touch():
             raise InputError(
@@ -89,18 +91,20 @@ class PressureSlopes:
             q.x.array[nodes] = by_areas
             q.x.scatter_forward()
             areas = self.contact.surface.integral(q, self._current)
-        return PressureWeights(np.where(eq.normal, own[eq.contactor], 0.0), areas, now, drawn)
+        every = np.zeros(len(self._whole.nodes))
+        every[self._rows] = own
+        return PressureWeights(np.where(eq.normal, every[eq.contactor], 0.0), areas, now, drawn)
 
     def along(self, multipliers: Array, du: fem.Function, shape: fem.Function) -> Array:
         """Changes of the pressures of this rank's contactors ``(n,)`` (collective).
 
         Args:
-            multipliers: changes of the multipliers of the pair's equations ``(m,)``.
+            multipliers: changes of the multipliers of the equations ``(m,)``.
             du: change of the displacement, and of all other fields.
             shape: change of the reference positions of the nodes, in the displacement's space.
         """
         config, nodes, p = self._config, self._pair.nodes, self._pressures
-        lam, areas = self._pair.forces(self._equations, multipliers).lam, np.zeros(len(nodes))
+        lam, areas = self._whole.forces(self._equations, multipliers).lam[self._rows], np.zeros(len(nodes))
         if self.contact.contactor.dim > 0:
             V = compat.function_space(config.mesh, config.degree)
             area = self.contact.surface.integral(ufl.TestFunction(V), self._current)

@@ -25,10 +25,11 @@ class Record:
     Attributes:
         before: initial state of the step.
         displacement: at its end ``(n_local incl. ghosts,)``.
-        states: of the pairs in equilibrium, before their commit.
-        motions: of the pairs' rigid targets.
+        states: of the interfaces in equilibrium, before their commit.
+        motions: of their rigid targets.
         values: of Constants and Functions in the residual.
-        friction, offsets: of the pairs' contactors ``(n,)`` each, or None.
+        friction: of the interfaces' contactors ``(n,)`` each, or None.
+        offsets: of the contacts' contactors ``(n,)`` each, or None.
         shares: of Constants and offsets, see ``solve.taken``, by their ids.
         held: shares of Dirichlet values, ghosts included ``(n,)``, or one share of all.
         dt: length of a time step; 0 in statics.

@@ -99,10 +99,10 @@ def shape_slopes_of(problem: UnitedProblem, equations: Sequence[ContactRows]) ->
 
     Args:
         problem: in the state of the derivatives.
-        equations: of each of its pairs.
+        equations: of each of its interfaces.
     """
     found, first = list[tuple[slice, ShapeSlopes | RigidSlopes]](), 0
-    for pair, own in zip(problem.pairs, equations):
+    for pair, own in zip(problem.interfaces, equations):
         if pair.tie is not None and pair.tie.rows is not None and pair.trial.bond is not None:
             slopes = of_tie(pair.tie, pair.trial.bond)
             found.append((slice(first + len(own) - len(slopes.rows[0]), first + len(own)), slopes))

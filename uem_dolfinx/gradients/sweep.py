@@ -25,7 +25,8 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.pair.interface import in_question
+from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.pair.interface import table_of
 from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
 from uem_dolfinx.errors import InputError
@@ -35,11 +36,11 @@ from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.derivatives import Derivatives, transposed
 from uem_dolfinx.gradients.gradient import AnyControl
 from uem_dolfinx.gradients.linearised import Linearised
-from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of
+from uem_dolfinx.gradients.parameters import ContactParameter, acting, led_for, motion_of
 from uem_dolfinx.gradients.records import Record
 from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.bodies.tangent import contact_curvature, curvature_of, slip_terms, together
+from uem_dolfinx.solve.bodies.tangent import contact_curvature, curvature_of, together
 from uem_dolfinx.solve.memory import Memory
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.system import BodySystem
@@ -60,9 +61,9 @@ class Sweep:
         self.problem, self._controls = problem, controls
         self.found: list[Any] = [None] * len(controls)
         self._derivatives = Derivatives(problem.bodies.F, problem.u.function_space, problem.config.V)
-        self._by_anchors = [np.zeros((0, 0))] * len(problem.pairs)
-        self._sections = [section_of(contact) for contact in problem.contacts]
-        #: Derivatives by the openings of locked sections, by the number of their contact.
+        self._by_anchors = [np.zeros((0, 0))] * len(problem.interfaces)
+        self._sections = [section_of(pair) for pair in problem.interfaces]
+        #: Derivatives by the openings of locked sections, by the number of their interface.
         self._by_opening = [0.0] * len(self._sections)
         self._rates = None if problem.dynamics is None else RateSlopes(problem.dynamics)
         laws: list[Any] = problem.materials
@@ -153,7 +154,7 @@ class Sweep:
     def begin(self, first: Record) -> None:
         """Add derivatives by the initial anchors of the first step, the positions of contactors before it (collective)."""
         problem = self.problem
-        if not any(pair.friction is not None for pair in problem.pairs):
+        if not any(pair.friction is not None for pair in problem.interfaces):
             return
         Memory.put_back(first.before, problem)
         slopes = anchor_slopes_of(problem)
@@ -181,7 +182,7 @@ class Sweep:
             if isinstance(m, fem.Constant):
                 own = self._derivatives.by_constant(terms, m) - self._by_nodal_forces(m, a)
                 self._add(k, start.shares.get(id(m), 1.0) * own)
-            elif isinstance(m, ContactParameter) and (section := section_of(m.contact)) is not None:
+            elif isinstance(m, ContactParameter) and (section := section_of(m.contact.pair)) is not None:
                 self._add(k, -self._work(a, by_section(section, m.parameter, 0)[1]))
             elif isinstance(m, fem.Function):
                 more = self._derivatives.by_function(terms, m)
@@ -242,7 +243,7 @@ class LinearisedStep(Linearised):
     def __init__(self, problem: UnitedProblem, record: Record, derivatives: Derivatives, rates: RateSlopes | None):
         super().__init__(problem, derivatives, record.held)
         self._led, self._rates = record.shares, rates
-        #: Derivatives by the anchors of each contact with friction.
+        #: Derivatives by the anchors of each interface with friction.
         self.slopes: list[AnchorSlopes | None] = []
         #: Derivative of the work of damping along ``a`` by the velocity ``(n,)``; 0 without damping.
         self.damped: Array | float = 0.0
@@ -253,15 +254,15 @@ class LinearisedStep(Linearised):
 
     def _linearise(self) -> None:
         problem = self.problem
-        state, pairs = self._state(), problem.pairs
+        state = self._state()
         self.slopes = anchor_slopes_of(problem)
-        if state.rows.independent is not None and state.rows.independent.found and any(self.slopes):
+        if state.rows.conflict and any(self.slopes):
             raise InputError(
                 "equations of contactors with friction conflict with each other or with Dirichlet conditions, and have been replaced by "
                 "others, through which histories have no derivatives; let nodes be contactors of one contact, with free normals"
             )
         forms.free_petsc_garbage(problem.comm)
-        self.Q, self.K, self.G = state.test, problem.bodies.update_tangent(), self.stiffness_of(range(len(pairs)))
+        self.Q, self.K, self.G = state.test, problem.bodies.update_tangent(), self.stiffness_of()
         if problem.linear is not None and (parts := [*problem.linear.curvature(), *problem.linear.stiffness()]):
             self.G = together(self.G, contact_curvature(parts, self.config.unknowns.vector()))
         K = self.K
@@ -279,22 +280,15 @@ class LinearisedStep(Linearised):
         if solver.iterative or not solver.lasting or any(self.slopes):
             self.problem.system.forget()
 
-    def stiffness_of(self, which: Sequence[int]) -> PETSc.Mat | None:
+    def stiffness_of(self, contact: Contact | None = None) -> PETSc.Mat | None:
         """As in ``Linearised``, with the terms of friction (collective)."""
-        pairs, slopes = [self.problem.pairs[k] for k in which], [self.slopes[k] for k in which]
-        states, like = [pair.trial for pair in pairs], self.config.unknowns.vector()
-        for pair, own in zip(pairs, slopes):
-            pair.trial = pair.trial if own is None else own.without_stuck()
-        try:
-            curvature = together(curvature_of(in_question(pairs), like, any(self.slopes), False), self.stiffness_of_gaps(which))
-        finally:
-            for pair, state in zip(pairs, states):
-                pair.trial = state
-        if self.config.gdim == 2 or not any(slopes):
-            return curvature
-        turned, _ = slip_terms([pair for pair in in_question(pairs) if not pair.trial.has_law], like)
-        leaning = contact_curvature([part for own in slopes if own is not None for part in own.leaning()], like)
-        return together(together(curvature, turned), leaning)
+        known, like = dict(zip(map(id, self.problem.interfaces), self.slopes)), self.config.unknowns.vector()
+        pairs = [(pair, state, known[id(pair)]) for pair, state in acting(self.problem, contact)]
+        states = [state if own is None else own.without_stuck(state) for _, state, own in pairs]
+        curvature = curvature_of([pair for pair, *_ in pairs], like, any(self.slopes), False, states=states)
+        curvature = together(curvature, self.stiffness_of_gaps(pairs))
+        turned = [part for _, state, own in pairs if own is not None for part in own.turned(state)]
+        return together(curvature, contact_curvature(turned, like) if turned else None)
 
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``Q mu`` with ``P'(K + G)'Q mu = P' forces`` (collective)."""
@@ -308,10 +302,6 @@ class LinearisedStep(Linearised):
             self.damped = damped_by(self.problem, self.derivatives, a)
             found.array[:] += self._rates.beyond_tangent(np.array(a.array_r), self.damped)
         return found
-
-    def body_stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
-        """``K' a`` (collective)."""
-        return forms.product(self._K_back, a)
 
     def handed_back(self, by_anchors: list[Array]) -> tuple[Any, list[Array]]:
         """Derivatives by final positions, from derivatives by final anchors, and by the anchors that are unchanged (collective)."""
@@ -339,7 +329,7 @@ def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) ->
 
 def anchor_slopes_of(problem: UnitedProblem) -> list[AnchorSlopes | None]:
     """Derivatives by anchors in the present trial states, None without friction (collective)."""
-    return [AnchorSlopes(pair, c.name) if pair.friction is not None else None for pair, c in zip(problem.pairs, problem.contacts)]
+    return [AnchorSlopes(pair) if pair.friction is not None else None for pair in problem.interfaces]
 
 
 def _back(
@@ -363,9 +353,12 @@ def _left_behind(
     first: bool = False,
 ) -> Array:
     """Derivatives by a motion of the target, from derivatives by anchors, the positions of its contactors relative to it (collective)."""
-    found, k = np.zeros(m.shape(problem.config.gdim)), problem.contacts.index(m.contact)
+    found, (whole, rows) = np.zeros(m.shape(problem.config.gdim)), table_of(m.contact.pair)
+    k = problem.interfaces.index(whole)
     if m.parameter in ("place", "turn") and (at := slopes[k]) is not None:
-        handed, _ = at.back(by_anchors[k], first)
+        own = np.zeros_like(by_anchors[k])
+        own[rows] = by_anchors[k][rows]
+        handed, _ = at.back(own, first)
         for entry in np.ndindex(found.shape):
             found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()
     return np.asarray(reduced(problem.comm, found))

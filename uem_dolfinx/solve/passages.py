@@ -80,7 +80,8 @@ def refuse_passages(
             continue
         if len(pair.members) > 1:
             each: Any = motions_of_each(motion, len(pair.members))  # type: ignore[arg-type]
-            refuse_passages(config, pair.members, start, each, moving)
+            on = pair.discretisation.setting.on
+            refuse_passages(config, list(compress(pair.members, on)), start, list(compress(each, on)), moving)
             continue
         if isinstance(pair.target, MeshTarget):
             total = all_ways[:, k, 2:].sum(axis=0)

@@ -101,6 +101,8 @@ class NodeToSurface(OnTarget):
                 nearest = projection = self.on_target(points, self.anchor)
         moves = self._target_moves(projection) if self.setting.prescribed else None
         left = [which(cast("FacetProjection", nearest)) for which in self._leaves]
+        if not self.setting.on.all():
+            left.append(~self.setting.on[self.setting.label])
         out = np.any(left, axis=0) if left else None
         return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves, out=out), state)
 

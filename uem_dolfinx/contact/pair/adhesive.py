@@ -36,10 +36,10 @@ class AdhesiveInterface(SofteningInterface):
         #: Multipliers of the rows of gaps, negative in attraction, and stiffnesses ``(n,)``.
         self._pull = self._stiffness = np.zeros(n)
 
-    def activate_touching(self) -> None:
+    def activate_touching(self, which: Bools | bool = True) -> None:
         """See ``Interface``; a contact that was switched off attracts again."""
         self.trial = self.committed = replace(self.committed, cohesion=np.zeros((len(self.nodes), 2)))
-        super().activate_touching()
+        super().activate_touching(which)
 
     def project(self) -> None:
         """See ``Interface``; the law gives the attraction there (collective)."""
@@ -73,12 +73,13 @@ class AdhesiveInterface(SofteningInterface):
         pull = nodes, blocks, np.zeros(v.shape)
         return pull if own is None else together(own, pull)
 
-    def curvature(self) -> list[tuple[Ints, Array]]:
+    def curvature(self, state: PairState | None = None) -> list[tuple[Ints, Array]]:
         """See ``Interface``; the attraction bends as the contact forces do (collective)."""
-        state, share = self.trial, self.kinematics.pressure_map(False).force
+        share = self.kinematics.pressure_map(False).force
         none, lam = np.zeros(len(share), dtype=bool), self._pull * share
-        pulled = replace(state, active=none, lam=lam, nodal=lam, force=0.0 * state.force, held=np.full_like(state.held, -1))
-        return super().curvature() + self.kinematics.curvature(pulled)
+        t = self.trial
+        pulled = replace(t, active=none, lam=lam, nodal=lam, force=0.0 * t.force, held=np.full_like(t.held, -1))
+        return super().curvature(state) + self.kinematics.curvature(pulled)
 
     # -- results ---------------------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ The trial state changes in every iteration, the committed state only after conve
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -124,11 +125,11 @@ class Interface:
             state = self.friction.come_and_go(state, self.trial.active)
         self.trial = state
 
-    def activate_touching(self) -> None:
-        """Activate contactors that initially touch without force; with friction they stick (collective)."""
+    def activate_touching(self, which: Bools | bool = True) -> None:
+        """Activate contactors, or ``which (n,)``, that initially touch without force; with friction they stick (collective)."""
         anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
         k = self.kinematics
-        state = active_set.touching(self.trial, k.gap, self.config.size, ~self.off & k.movable)
+        state = active_set.touching(self.trial, k.gap, self.config.size, which & ~self.off & k.movable)
         self.set_active(replace(state, at_end=k.ends.held(self.trial)))
         if anchored is not None and self.trial.friction is not None:
             self.trial = replace(self.trial, friction=replace(anchored, stick=self.trial.friction.stick))
@@ -267,12 +268,15 @@ class Interface:
         state = self.with_forces(found)
         self.trial = state if active is None else replace(state, active=active)
 
-    def curvature(self) -> list[tuple[Ints, Array]]:
-        """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective)."""
-        along = None if self.friction is None else self.friction.along(self.trial, self.kinematics)
-        k = self.kinematics
-        parts = k.curvature(self.trial) if along is None else k.curvature(self.trial, along)
-        return parts if self.tie is None else parts + self.tie.curvature(self.trial)
+    def curvature(self, state: PairState | None = None) -> list[tuple[Ints, Array]]:
+        """Blocks of ``-sum lambda d(row)/du``: lists of global nodes ``(k, m)`` and values ``(k, m g, m g)`` (collective).
+
+        With the forces of a ``state``; None is the trial state.
+        """
+        state, k = state or self.trial, self.kinematics
+        along = None if self.friction is None else self.friction.along(state, k)
+        parts = k.curvature(state) if along is None else k.curvature(state, along)
+        return parts if self.tie is None else parts + self.tie.curvature(state)
 
     def slip_terms(self, convex: bool = False) -> tuple[Ints, Array, Array] | None:
         """Terms of sliding friction in tangent and residual: nodes and blocks as in ``curvature``, forces ``(k, (1 + nn) gdim)``."""
@@ -419,6 +423,13 @@ class Interface:
 def name_at(pair: Interface, i: int) -> str:
     """Name of the contact of a contactor."""
     return str(pair.members[pair.discretisation.setting.label[i]].name)
+
+
+def table_of(pair: Interface) -> tuple[Interface, slice]:
+    """The interface in use that contains the contactors of a contact's, and their rows in it."""
+    whole = pair.whole
+    first = sum(len(one.nodes) for one in takewhile(lambda one: one is not pair, whole.members))
+    return whole, slice(first, first + len(pair.nodes))
 
 
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:

@@ -24,7 +24,6 @@ class JoinedInterface(Interface):
         own: interfaces of the contacts, equal except for surfaces, friction values, offsets and penetration bounds.
 
     Attributes:
-        own: as above.
         members: access to each of the contacts.
     """
 
@@ -36,7 +35,6 @@ class JoinedInterface(Interface):
         sliding = [pair.friction for pair in own if pair.friction is not None]
         friction = JoinedSliding(sliding, nodal) if sliding else None
         super().__init__(first.config, nodal.nodes, nodal, friction, name=first.name, max_penetration=first.max_penetration)
-        self.own = list(own)
         self._members: list[weakref.ref[Member]] = []
         here, surface = nodal.target.here, nodal.surface_of
         parts = [_renumbered(p.committed, lambda f, s=s: here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
@@ -47,9 +45,9 @@ class JoinedInterface(Interface):
         """Members of the contacts."""
         return [one for member in self._members if (one := member()) is not None]
 
-    def make_members(self) -> list[Member]:
+    def make_members(self, own: Sequence[Interface]) -> list[Member]:
         """Make the members; the caller keeps references to them, and they keep this interface."""
-        members = [Member(self, k, pair) for k, pair in enumerate(self.own)]
+        members = [Member(self, k, pair) for k, pair in enumerate(own)]
         self._members = list(map(weakref.ref, members))
         return members
 
@@ -66,19 +64,11 @@ class JoinedInterface(Interface):
 
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""
-        before, far = self.committed, self.discretisation.setting.far[self.discretisation.setting.label]
+        before, s = self.committed, self.discretisation.setting
+        skipped = (s.far | ~s.on)[s.label]
         super().commit()
-        if far.any():
-            self.trial = self.committed = _with_rows(self.committed, far, _rows(before, far))
-
-    def part(self) -> list[Interface]:
-        """The separate interfaces of the contacts, in their committed states; call ``project`` afterwards (collective)."""
-        for k, pair in enumerate(self.own):
-            if pair.friction is not None:
-                pair.friction.free = self.discretisation.free[self.discretisation.rows_of[k]]
-            pair.remember(self.state_of(k, self.committed))
-            pair.trial = self.state_of(k, self.trial)
-        return self.own
+        if skipped.any():
+            self.trial = self.committed = _with_rows(self.committed, skipped, _rows(before, skipped))
 
 
 def _each(change: Callable[..., Any], *states: PairState) -> PairState:

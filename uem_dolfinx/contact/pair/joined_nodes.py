@@ -49,7 +49,7 @@ class JoinedNodes(NodeToSurface):
         super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
         self._own = own
         none = np.zeros(len(own), dtype=bool)
-        self.set(far=none, mutual=none, label=label)
+        self.set(far=none, on=~none, mutual=none, label=label)
         if any(one.offset is not None for one in own):
             self.set(offset=np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
 

@@ -134,19 +134,25 @@ class Member(Interface):
 
     # -- changes between steps -------------------------------------------------------------------------------------------
 
+    def activate_touching(self, which: Bools | bool = True) -> None:
+        """See ``Interface``; contactors of other contacts stay as they are (collective)."""
+        own = np.zeros(len(self.joined.nodes), dtype=bool)
+        own[self._rows] = which
+        self.joined.activate_touching(own)
+
     def set_offset(self, offset: Array | None) -> None:
         """Set offsets ``(n,)``; contactors must be placed again (collective)."""
         self.discretisation.set(offset=offset)
         nodal = self.joined.discretisation
         every = np.zeros(len(nodal.nodes)) if nodal.offset is None else nodal.offset.copy()
         every[self._rows] = 0.0 if offset is None else offset
-        others = any(pair.discretisation.setting.offset is not None for pair in self.joined.own)
+        others = any(pair.discretisation.setting.offset is not None for pair in self.joined.members)
         nodal.set(offset=every if others else None)
 
     def set_friction(self, law: FrictionLaw, value: Array, known: bool = False) -> None:
         """See ``Interface`` (collective)."""
         assert self.friction is not None
         self.friction.set(law, value)
-        own = [pair.friction for pair in self.joined.own if pair.friction is not None]
+        own = [pair.friction for pair in self.joined.members if pair.friction is not None]
         every = JoinedLaw([one.limits.law for one in own], self.joined.discretisation.setting.label)
         self.joined.set_friction(every, np.concatenate([one.value for one in own]), known)

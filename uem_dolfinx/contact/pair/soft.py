@@ -275,7 +275,7 @@ class SoftInterface(Interface):
         """None."""
         return Violations.none(len(self.nodes))
 
-    def activate_touching(self) -> None:
+    def activate_touching(self, which: Bools | bool = True) -> None:
         """None, but ends hold contactors that touch there, and pressures begin to act (collective)."""
         self.trial = self.committed = replace(
             self.trial,

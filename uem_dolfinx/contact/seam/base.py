@@ -50,7 +50,7 @@ class OnTarget:
         self.config, self.nodes, self.target, self.sliding, self.thickness = config, nodes, target, sliding, thickness
         self.contactor = contactor
         self.traits, none = self.traits._replace(sliding=sliding), np.zeros(1, dtype=bool)
-        self.setting = Setting(free, False, far=none, mutual=none, label=np.zeros(len(nodes), dtype=np.int64))
+        self.setting = Setting(free, False, far=none, on=~none, mutual=none, label=np.zeros(len(nodes), dtype=np.int64))
         self.set(free=free)
         self.anchor: Projection | None = None
         self.asked = True

@@ -363,6 +363,7 @@ class Setting(NamedTuple):
         free: components of all owned nodes without Dirichlet condition ``(n_owned, gdim)``.
         prescribed: whether any contactor on any rank has a Dirichlet condition.
         far: contacts whose surfaces are separated, so that their contactors are skipped, see ``solve.bodies.far_apart`` ``(n_contacts,)``.
+        on: contacts that are switched on; contactors of others are left out ``(n_contacts,)``.
         mutual: contacts whose contactors and target follow each other (two-pass) ``(n_contacts,)``.
         label: number of the contact of each contactor ``(n,)``.
         offset: heights minus gaps ``(n,)``; None without offset.
@@ -372,6 +373,7 @@ class Setting(NamedTuple):
     free: Bools
     prescribed: bool
     far: Bools
+    on: Bools
     mutual: Bools
     label: Ints
     offset: Array | None = None

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.seam.state import PairState
     from uem_dolfinx.contact.warnings.edges_inside import EdgesInside, Meeting
-    from uem_dolfinx.contact.warnings.target_corners import CornerInside, TargetCorners
+    from uem_dolfinx.contact.warnings.target_corners import CornerInside
 
 
 class WatchedContact(OfBothSides):
@@ -147,10 +147,8 @@ class Watch:
             from uem_dolfinx.contact.warnings.seams import warn_of_seams
 
             warn_of_seams([contact.pair for contact in contacts])
-        self._corners: dict[int, tuple[TargetCorners, list[WatchedContact]]] = {}
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
-        self._off_at_start: dict[int, Bools] = {}
-        self.begin()
+        self._begin()
         self._take_edges()
         for group in _by_interface([c for c in contacts if not c.adjust]).values():
             _warn_of_sagging_facets(group)
@@ -171,16 +169,12 @@ class Watch:
         edges = [(EdgesInside(meeting), group) for meeting, group in meetings.values()]
         self._edges = [(one, group) for one, group in edges if one.any]
 
-    def begin(self) -> None:
-        """Begin or continue with the present interfaces of contacts (collective)."""
+    def _begin(self) -> None:
+        """Find the corners of targets, and contactors past ends at the start (collective)."""
         from uem_dolfinx.contact.warnings.target_corners import TargetCorners
 
-        forces = {id(c): f for corners, group in self._corners.values() for c, f in zip(group, corners.largest)}
-        self._corners = {}
-        for key, group in _by_interface([c for c in self._contacts if c.sees_corners]).items():
-            corners = TargetCorners([c.pair for c in group], [c.contactor for c in group])
-            corners.largest = np.array([forces.get(id(c), 0.0) for c in group])
-            self._corners[key] = corners, group
+        groups = _by_interface([c for c in self._contacts if c.sees_corners]).values()
+        self._corners = [(TargetCorners([c.pair for c in group], [c.contactor for c in group]), group) for group in groups]
         own = {id(c.pair): c.off_at_start for c in self._contacts}
         wholes = {key: group[0].pair.whole for key, group in _by_interface(self._contacts).items()}
         self._off_at_start = {key: np.concatenate([own[id(m)] for m in whole.members]) for key, whole in wholes.items()}
@@ -233,7 +227,7 @@ class Watch:
             return {}
         found: dict[WatchedContact, CornerInside] = {}
         checked = set(map(id, contacts))
-        for corners, group in self._corners.values():
+        for corners, group in self._corners:
             of_group = corners.find(stiffness, np.array([id(c) in checked for c in group]))
             found |= {group[k]: corner for k, corner in of_group.items()}
         return found

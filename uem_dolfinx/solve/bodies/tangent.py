@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.configuration import Configuration
@@ -178,7 +179,12 @@ def convex_part(blocks: Array) -> Array:
 
 
 def curvature_of(
-    pairs: Sequence[Interface], du: PETSc.Vec, apart: bool, convex: bool, linear: UserRows | None = None
+    pairs: Sequence[Interface],
+    du: PETSc.Vec,
+    apart: bool,
+    convex: bool,
+    linear: UserRows | None = None,
+    states: Sequence[PairState] | None = None,
 ) -> PETSc.Mat | None:
     """``-sum lambda grad^2 g`` of all pairs and of rigid couplings, or None if it vanishes (collective).
 
@@ -188,11 +194,13 @@ def curvature_of(
         apart: whether P differs from Q; otherwise only the symmetric part is used.
         convex: whether terms that could make the tangent indefinite are neglected.
         linear: equations of users, or None.
+        states: whose forces act; None for the trial states.
     """
-    moving = [pair for pair in pairs if pair.discretisation.traits.sliding == "finite"]
+    found = zip(pairs, states or [pair.trial for pair in pairs])
+    moving = [(pair, state) for pair, state in found if pair.discretisation.traits.sliding == "finite"]
     if not moving and linear is None:
         return None
-    parts = [part for pair in moving for part in pair.curvature()]
+    parts = [part for pair, state in moving for part in pair.curvature(state)]
     parts += [] if linear is None else linear.curvature()
     for i, (nodes, blocks) in enumerate(parts):
         # in place, to save memory

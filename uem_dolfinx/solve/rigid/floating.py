@@ -104,10 +104,6 @@ class FloatingBodies:
         #: Open motions including those that only friction resists, if all contactors slip ``(n_motions, k)``.
         self._sliding: Array = np.zeros((0, 0))
 
-    def take(self, pairs: Sequence[Interface], far_apart: FarApart) -> None:
-        """Replace the interfaces of the contacts, and the record of contacts that are searched."""
-        self._pairs, self._far_apart = pairs, far_apart
-
     @cached_property
     def _has_springs(self) -> bool:
         """Whether springs may hold bodies: springs at nodes, or a form that depends on the values of u, not only on gradients."""

@@ -21,6 +21,7 @@ from uem_dolfinx.contact.switched import (
     hold,
     leave_friction,
     leave_preload,
+    mark,
     refuse_ramp,
     settle,
     switch_off,
@@ -36,7 +37,6 @@ from uem_dolfinx.solve.loading import check_load, refuse_idle
 from uem_dolfinx.solve.memory import move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.reactions import owned_displacement, reactions
-from uem_dolfinx.solve.steps.parted import part_contacts
 from uem_dolfinx.solve.steps.step import Step
 from uem_dolfinx.solve.united.system import BodySystem
 
@@ -163,9 +163,6 @@ class Stage:
     def _switch(self, fresh: bool) -> None:
         """Apply the step's conditions and contacts, and keep the forces of released conditions and contacts (collective)."""
         problem, step = self._problem, self.step
-        if step.contacts:
-            # similar contacts that were joined may be switched separately
-            part_contacts(problem)
         bodies, held = problem.bodies, problem.bodies.held
         parts = [
             (part, on) for one, on in step.contacts.items() for part in (one.all_parts if isinstance(one, Contact) else one.parts)
@@ -181,7 +178,7 @@ class Stage:
         for pair in problem.interfaces if other else ():
             hold(pair, bodies.free[: problem.config.n_owned], None if not fresh else problem.config.of(changed).any(axis=1))
         for part, on in parts:
-            part.switch(on)
+            mark(part, on)
         for part in left if fresh else ():
             switch_off(part.pair)
         for part in come if fresh else ():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import TYPE_CHECKING
 
 from mpi4py import MPI
@@ -52,16 +53,15 @@ class OverConstraints:
         #: The restriction made last.
         self._last: Restriction | None = None
         # joined contacts are compared one by one
-        surfaces, which = _surfaces([one for pair in pairs for one in pair.members])
-        follows = [followed_nodes(config, dofs) for dofs in surfaces]
         whole, pairs = pairs, [one for pair in pairs for one in pair.members]
-        table: Bools = np.zeros((len(follows), config.n_local), dtype=bool)
-        for k, own in enumerate(follows):
-            table[k] = own
-        meets: Bools = np.zeros((len(pairs), len(pairs)), dtype=bool)
-        for k, pair in enumerate(pairs):
-            meets[k] = np.asarray(table[:, pair.nodes].any(axis=1))[which]
-        contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in pairs)])
+        surfaces, which = _surfaces(pairs)
+        follows = [followed_nodes(config, dofs) for dofs in surfaces]
+        table: Bools = np.array(follows, dtype=np.bool_).reshape(-1, config.n_local)
+        meeting = [np.asarray(table[:, pair.nodes].any(axis=1))[which] for pair in pairs]
+        meets: Bools = np.array(meeting, dtype=np.bool_).reshape(len(pairs), len(pairs))
+        on = np.concatenate([np.zeros(0, dtype=bool), *(pair.discretisation.setting.on for pair in whole)])
+        meets &= on & on[:, None]
+        contactors = np.concatenate([np.zeros(0, np.int32), *(pair.nodes for pair in compress(pairs, on))])
         shared = len(np.unique(contactors)) < len(contactors)
         found = np.append(meets.ravel(), shared)
         config.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.LOR)

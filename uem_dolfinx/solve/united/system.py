@@ -90,21 +90,16 @@ class BodySystem:
 
     def take(self, pairs: Sequence[Interface], linear: UserRows | None) -> None:
         """Replace all pairs and equations of users, under the bodies' present conditions, from the next step on (collective)."""
-        self.linear = linear
-        self.regroup(pairs)
-        self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
-
-    def regroup(self, pairs: Sequence[Interface]) -> None:
-        """Take the contactors of the same contacts in other pairs, between two steps (collective)."""
         from uem_dolfinx.solve.bodies.far_apart import FarApart
 
-        self.pairs = list(pairs)
+        self.linear, self.pairs = linear, list(pairs)
         self.rows: Rows | None = None  # equations of the last state
         self._here: Rows | None = None  # equations at the last projection, with its slip directions; None until needed
         self._look()
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         self.over_constraints = OverConstraints(self.config, self.pairs, self.linear)
         self.solver.condensed.beside = nodes_beside(self.config, self.pairs)
+        self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
 
     def _look(self) -> None:
         """Collect the pairs that may be in contact on any rank; iterations loop over these only."""
