@@ -47,6 +47,12 @@ class Nodes:
         """Let these of all contactors be active."""
         self.trial = replace(self.trial, active=self.of_all(which))
 
+    def take(self, state, pivot=None):
+        """Have another trial state, and pivot of friction."""
+        self.trial = state
+        if pivot is not None:
+            self.friction.pivot = pivot
+
     def project(self):
         """They stay where they are."""
 

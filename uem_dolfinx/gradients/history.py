@@ -367,7 +367,7 @@ class History(given.Sealed):
         problem.u.x.array[:] = record.displacement
         move_targets(problem, record.motions)
         for pair, state in zip(problem.interfaces, record.states):
-            pair.trial = state
+            pair.take(state)
         if problem.dynamics is not None and record is not self._start:
             problem.dynamics.begin(record.dt)
 

@@ -25,6 +25,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.friction.pivot import Pivot
     from uem_dolfinx.contact.friction.sliding import Sliding
     from uem_dolfinx.contact.thermal.heat import Heat
     from uem_dolfinx.contact.ties.tie import Tie
@@ -119,10 +120,12 @@ class Interface:
         else:
             self.trial = self.committed = self.friction.other_law(self.committed, law, value)
 
-    def set_active(self, state: PairState) -> None:
-        """Set the trial state, with another active set."""
-        if self.friction is not None and state.active is not self.trial.active:
-            state = self.friction.come_and_go(state, self.trial.active)
+    def take(self, state: PairState, pivot: Pivot | None = None) -> None:
+        """Set the trial state, with its ``pivot`` of friction; friction begins anew where the active set alone is another."""
+        if self.friction is not None:
+            self.friction.pivot = pivot or self.friction.pivot
+            if state.friction is self.trial.friction and state.active is not self.trial.active:
+                state = self.friction.come_and_go(state, self.trial.active)
         self.trial = state
 
     def activate_touching(self, which: Bools | bool = True) -> None:
@@ -130,7 +133,7 @@ class Interface:
         anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
         k = self.kinematics
         state = active_set.touching(self.trial, k.gap, self.config.size, which & ~self.off & k.movable)
-        self.set_active(replace(state, at_end=k.ends.held(self.trial)))
+        self.take(replace(state, at_end=k.ends.held(self.trial)))
         if anchored is not None and self.trial.friction is not None:
             self.trial = replace(self.trial, friction=replace(anchored, stick=self.trial.friction.stick))
         # a first step that fails and is cut starts again from this state
@@ -143,7 +146,7 @@ class Interface:
         off, before = self.off, self.kinematics
         gone = bool((self.trial.active & off).any())
         self.kinematics, state = before.follow(self.trial, off)
-        self.set_active(state)
+        self.take(state)
         moved = self.kinematics is not before
         if moved and self.friction is not None:
             self.friction.replace(self.kinematics)
@@ -197,7 +200,7 @@ class Interface:
 
         def enter(state: PairState) -> PairState:
             self.trial = state
-            self.set_active(active_set.exchange(state, violated))
+            self.take(active_set.exchange(state, violated))
             return self.trial
 
         if self.friction is None:

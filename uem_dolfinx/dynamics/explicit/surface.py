@@ -57,7 +57,7 @@ class Prediction:
         if system.rows is None:
             # the first step of a run that goes on
             bodies.update_tangent()
-            system.rows = system.present_rows()
+            system.rows_of_last()
         if not self.kept:
             self._prepare()
         u = np.array(start)

@@ -298,7 +298,7 @@ class FloatingBodies:
                 # without friction, rigid motions may have separated contactors from the target
                 if pair.friction is None:
                     near = pair.kinematics.gap <= TOUCHING * self._bodies.config.size
-                    pair.set_active(replace(pair.trial, active=pair.trial.active & near))
+                    pair.take(replace(pair.trial, active=pair.trial.active & near))
             v, took = self._step(damping, freely)
             changed |= took
             if v is None:
@@ -432,7 +432,7 @@ def _activate(pair: Interface, closing: Ints) -> bool:
     now = closing[(closing >= 0) & (pair.kinematics.gap[closing] <= TOUCHING * pair.config.size)]
     active = pair.trial.active.copy()
     active[now] = True
-    pair.set_active(replace(pair.trial, active=active))
+    pair.take(replace(pair.trial, active=active))
     return bool(reduced(pair.config.comm, len(now)))
 
 

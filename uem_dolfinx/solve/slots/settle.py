@@ -102,7 +102,7 @@ class _Slots:
 
     def take(self, active: Bools, stick: Bools, direction: Array, slip: Array, force: Array) -> None:
         """Set the state of the contactors ``(k,)``; slip directions, slips and friction are along the rows ``(k, gdim - 1)``."""
-        pair, i = self.pair, self.contactor
+        pair, i, pivot = self.pair, self.contactor, None
         before, friction, now = pair.trial.active, pair.friction, pair.trial.active.copy()
         now[i] = active
         state = active_set.exchange(pair.trial, Violations(now & ~before, before & ~now, np.zeros(len(now))))
@@ -118,8 +118,8 @@ class _Slots:
             q, of_slip, j = friction.pivot.q.copy(), friction.pivot.tau.copy(), i[slides]
             c = friction.pivot.stiffness[j, None]
             q[j], of_slip[j] = c * way[slides] - tau[slides], c * friction.frame.slip[j]
-            friction.pivot = replace(friction.pivot, q=q, tau=of_slip)
-        pair.trial = state
+            pivot = replace(friction.pivot, q=q, tau=of_slip)
+        pair.take(state, pivot)
 
 
 def settle(

@@ -147,10 +147,8 @@ class StepperWithMass(ExplicitStepper):
     def _predict(self, free_to: Array) -> None:
         """Move all nodes to ``free_to (n,)``, as far as the equations of the last state let them (collective)."""
         problem, bodies, system = self.problem, self.bodies, self.system
-        if system.rows is None:
-            # the first step of a run that goes on
-            system.rows = system.present_rows()
-        P, Q = system.rows.frictionless, system.rows.test
+        rows = system.rows_of_last()
+        P, Q = rows.frictionless, rows.test
         if problem.linear is not None or not Q.n_equations:
             bodies.u.x.array[:] = free_to
             bodies.u.x.scatter_forward()

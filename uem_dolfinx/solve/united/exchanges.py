@@ -258,8 +258,8 @@ class Exchanges:
         """Return to the last state without a mechanism, and fix the limits given by its forces (collective)."""
         for pair, known in zip(self._pairs, self._known or ()):
             if pair.friction is not None and known is not None:
-                state, pair.friction.pivot = known
-                pair.trial = replace(state, reserved=pair.trial.reserved)
+                state, pivot = known
+                pair.take(replace(state, reserved=pair.trial.reserved), pivot)
                 pair.friction.hold_limits(state.lam)
         self._pivoting, self.held, self._were_held, self.again = Pivoting(), True, True, True
         self._solve_again()
@@ -269,7 +269,7 @@ class Exchanges:
         self._known, each = self._here(violated), np.zeros(2)
         for pair, known in zip(self._pairs, self._known):
             if pair.friction is not None and known is not None:
-                pair.trial = replace(known[0], reserved=pair.trial.reserved)
+                pair.take(replace(known[0], reserved=pair.trial.reserved))
                 each = np.maximum(each, pair.friction.hold_limits(pair.trial.lam))
         self._pairs[0].config.comm.Allreduce(MPI.IN_PLACE, each, op=MPI.MAX)
         if each[0] <= LIMITS_NEAR * each[1]:
@@ -376,7 +376,7 @@ def _calm(pair: Interface, which: Bools) -> bool:
 
     changes = pair.trial.changes
     some = which & pair.trial.active & (changes >= HOLD_AFTER) & (changes < MOST_CHANGES)
-    pair.trial = replace(pair.trial, changes=np.where(some, MOST_CHANGES, changes))
+    pair.take(replace(pair.trial, changes=np.where(some, MOST_CHANGES, changes)))
     return bool(some.any())
 
 

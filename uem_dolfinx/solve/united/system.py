@@ -234,13 +234,18 @@ class BodySystem:
         normal = pair.kinematics.projection.normal
         return np.asarray(np.einsum("ng,ng->n", normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
+    def rows_of_last(self) -> Rows:
+        """Equations of the last state; at the beginning of a run, or if it goes on, those at the last projection (collective)."""
+        self.rows = self.rows or self.present_rows()
+        return self.rows
+
     def present_rows(self) -> Rows:
         """Equations at the last projection, with its slip directions (collective)."""
         if self._here is None:
             for pair in self.near:
                 assert self.bodies.stiffness is not None
                 if pair.friction is not None:
-                    pair.trial = pair.friction.turn(pair.trial, pair.kinematics, self.bodies.stiffness)
+                    pair.take(pair.friction.turn(pair.trial, pair.kinematics, self.bodies.stiffness))
             self._here = self._rows()
         return self._here
 
