@@ -224,9 +224,9 @@ def test_checkpoints(friction, folder):
 
 
 def test_refused():
-    """Where crossings have no equations, as between segments, and for pressures and heat flows, which need areas."""
+    """Where crossings have no equations, for pressures and heat flows, which need areas."""
     for word, value in (
-        ("coupling", "mortar"), ("normal", uem.SoftContact(lambda g: np.maximum(-g, 0.0))), ("heat", uem.Conductance(1.0, field=1)),
+        ("normal", uem.SoftContact(lambda g: np.maximum(-g, 0.0))), ("heat", uem.Conductance(1.0, field=1)),
         ("friction", uem.Tresca(1.0)),
     ):  # fmt: skip
         refused(uem.InputError, ["edges = True", word], lambda more={word: value}: uem.GeneralContact(edges=True, **more))

@@ -68,6 +68,31 @@ def test_in_any_pose_size_and_order(friction, how):
     assert np.abs(force - general.force).max() < 1e-6 * np.abs(general.force).max()
 
 
+@pytest.mark.parametrize("general", [True, slow(False)])
+@pytest.mark.parametrize("friction", [0.0, slow(0.3)])
+def test_ridges_by_mortar(friction, general):
+    """Facets near a crossing of ridges do not touch: integrals add nothing to the forces that nodes have, with nodes there or not."""
+    how = {"surfaces": None if general else OUTSIDE, "edges": True, "friction": friction}
+    for shift in ((0.0, 0.0), (0.1, 0.15)):
+        found = []
+        for coupling in ("mortar", "node_to_surface"):
+            r = roofs(shift=shift, coupling=coupling, **how)
+            run(r.problem)
+            assert r.n_crossings == 1
+            found.append(r.force)
+        assert found[0] == pytest.approx(found[1], rel=1e-7, abs=1e-7 * abs(found[1][2]))
+
+
+@pytest.mark.slow
+def test_a_box_on_a_box_by_mortar():
+    """Turned by 45 degrees, with nodes at the crossings and without, facets touch up to them: the force of nodes to 1 %, none sideways."""
+    for n in (6, 7):
+        for surfaces in (FACES, None):
+            r = boxes(n, coupling="mortar", surfaces=surfaces)
+            assert r.n_crossings == 0 and side(r.force) < 1e-12
+            assert r.force[2] == pytest.approx(boxes(n, surfaces=FACES, corners=True).force[2], rel=0.01)
+
+
 @pytest.mark.parametrize("shift", [(0.0, 0.0), slow((0.25, 0.25)), slow((0.1, 0.15))])
 def test_roofs(shift):
     """Ridge over ridge: nodes alone have a force sideways of 43 % where both ridges have a node."""
@@ -136,7 +161,7 @@ def test_checkpoints(friction, folder):
     goes_on_from_checkpoints(begun, folder)
 
 
-@pytest.mark.parametrize("how", [{"coupling": "mortar"}, {"sliding": "small"}, {"tied": True}, {"friction": uem.Tresca(1.0)}])
+@pytest.mark.parametrize("how", [{"sliding": "small"}, {"tied": True}, {"friction": uem.Tresca(1.0)}])
 def test_refused(how):
     """Where crossings have no equations, by name; and without edges there is no further part."""
     refused(uem.InputError, ["edges = True goes with"], lambda: rods((5, 4), length=4.0, surfaces=OUTSIDE, edges=True, **how))

@@ -107,7 +107,7 @@ class Contact(WatchedContact, given.Sealed):
         corners: True makes nodes at pointed convex edges of a meshed target contactors of the contactor's facets, too, with
             ``"node_to_surface"`` and hard contact without wear, ``adjust`` and heat. False: they may enter between contactors.
         edges: True holds sharp convex edges of both bodies apart where they cross in 3D, by one equation at each crossing; with what
-            ``corners`` goes with, and ``"finite"`` sliding.
+            ``corners`` goes with, mortar too, and ``"finite"`` sliding.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.

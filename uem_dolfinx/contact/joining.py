@@ -39,8 +39,9 @@ def _further_parts(contact: Contact, config: Configuration, free: Bools, clock: 
     wanted = [word for word in ("corners", "edges") if getattr(contact, word)]
     found: list[FurtherPart] = []
     if wanted and not _takes_parts(contact):
+        nodal = "node-to-surface " * contact.corners
         raise InputError(
-            f"contact '{contact.name}': {wanted[0]} = True goes with hard node-to-surface contact of two meshes, without tied, "
+            f"contact '{contact.name}': {wanted[0]} = True goes with hard {nodal}contact of two meshes, without tied, "
             f"adjust, wear, heat, cohesion, leak and friction by area or temperature: leave {wanted[0]} out, or these"
         )
     order = -1 - next(_orders) if wanted else -1
@@ -67,6 +68,7 @@ def _takes_parts(contact: Contact) -> bool:
     law = as_law(contact.friction)
     plain = _plain(contact) and not contact.adjust
     nodal = isinstance(contact.pair.discretisation, NodeToSurface) and contact.coupling == "node_to_surface"
+    nodal |= contact.coupling == "mortar" and not contact.corners
     meshed = isinstance(contact.pair.target, MeshTarget) and contact.contactor.dim == contact.config.tdim - 1
     return plain and nodal and meshed and not (law.per_area or isinstance(law.field, OfTemperature))
 

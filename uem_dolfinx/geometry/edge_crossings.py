@@ -203,6 +203,7 @@ class Crossings:
         meet: function of two arrays of keys ``(n, m)`` that returns whether the first edge's nodes may be contactors of the second.
         overlap: bound on the initial penetration, a length.
         n_lists: how many crossings a node may have at once.
+        ridges: whether only those count at which facets near the crossing do not touch, as others have the facets' integrals.
 
     Attributes:
         nodes: owned nodes on edges, the contactors ``(n,)``.
@@ -212,8 +213,9 @@ class Crossings:
 
     def __init__(
         self, first: SharpLines, second: SharpLines, keys: tuple[Ints, Ints], meet: Callable[[Ints, Ints], Bools], overlap: float,
-        n_lists: int,
+        n_lists: int, ridges: bool = False,
     ):  # fmt: skip
+        self._least = RIDGES if ridges else -SECTOR
         self.first, self.second, self._keys, self._meet, self._overlap = first, second, keys, meet, overlap
         config = self._config = first.facets.config
         self.nodes = config.gather_owned(first.nodes.ravel())
@@ -371,7 +373,7 @@ class Crossings:
             left = np.minimum(np.where(first, xi, np.inf), np.where(last, 1.0 - xi, np.inf)) * length
             inside &= (g >= 0.0) | (-g <= left)
         # two corners on each other are held as nodes
-        return np.asarray(inside & (within >= -SECTOR) & ~at_corners)
+        return np.asarray(inside & (within >= self._least) & ~at_corners)
 
 
 def _lengths(x: Array) -> Array:

@@ -12,7 +12,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.edges.discretisation import Edges, EdgeTarget
 from uem_dolfinx.contact.edges.placement import EdgeKinematics
 from uem_dolfinx.contact.further.part import FurtherPart
-from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.seam.base import OnTarget
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.edge_crossings import Crossings, SharpLines
@@ -65,7 +65,7 @@ class EdgeContact(OfCrossings, FurtherPart):
         if self._number == 0:
             for part in (self._contact, *(one for one in self._contact.further if one.swaps)):
                 own = part.pair.discretisation
-                assert isinstance(own, NodeToSurface)
+                assert isinstance(own, OnTarget)
                 own.leave(partial(self._at_crossings, own.nodes, 0 if part.swaps else 1), self._order)
 
     def _at_crossings(self, nodes: Indices, side: int, _: FacetProjection) -> Bools:
@@ -89,5 +89,5 @@ def edges_of(contact: Contact, config: Configuration, order: int) -> list[EdgeCo
     if not (own.total and theirs.total):
         return []
     keys, overlap = (np.zeros((len(own.keys), 1), int), np.ones((len(theirs.keys), 1), int)), contact.pair.max_penetration
-    crossings = Crossings(own, theirs, keys, lambda one, _: np.ones(len(one), bool), overlap, LISTS)
+    crossings = Crossings(own, theirs, keys, lambda one, _: np.ones(len(one), bool), overlap, LISTS, contact.coupling == "mortar")
     return [EdgeContact(contact, order, crossings, number) for number in range(LISTS)]

@@ -27,10 +27,10 @@ class EdgeContact(OfCrossings, BodiesContact):
         self._crossings, self._number, self._skin, self._order = crossings, number, neighbours.skin, neighbours.number
 
 
-def crossings_of(neighbours: Neighbours, overlap: float) -> Crossings | None:
+def crossings_of(neighbours: Neighbours, overlap: float, ridges: bool = False) -> Crossings | None:
     """Crossings of edges; None unless two bodies, or one that may touch itself, have any in 3D (collective).
 
-    Nodes follow the bodies later in the order, and in one body the edges with larger keys.
+    Nodes follow the bodies later in the order, and in one body the edges with larger keys; ``ridges`` as for ``Crossings``.
     """
     skin, place, itself = neighbours.skin, neighbours.place, neighbours.itself
     if skin.config.gdim < 3:
@@ -51,7 +51,7 @@ def crossings_of(neighbours: Neighbours, overlap: float) -> Crossings | None:
             may &= ~((a[:, 0] & b[:, 1]) | (a[:, 1] & b[:, 0]))
         return may
 
-    return Crossings(lines, lines, (keys, keys), meet, overlap, LISTS)
+    return Crossings(lines, lines, (keys, keys), meet, overlap, LISTS, ridges)
 
 
 def edge_contacts(neighbours: Neighbours, crossings: Crossings, name: str, options: dict[str, Any]) -> Sequence[EdgeContact]:

@@ -66,7 +66,7 @@ class GeneralContact(OfProblem, given.Sealed):
         normal: see ``Contact``; its pressure must be 0 from a gap of half a facet on. Only nearest facets press.
         heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
         edges: whether sharp edges of different bodies that cross are held apart in 3D, by one equation at each crossing; None:
-            if supported, with ``"node_to_surface"``, without ``normal``, ``heat`` and laws of friction by area.
+            if supported, without ``normal``, ``heat`` and laws of friction by area. With mortar, where edges are ridges.
         others: further arguments of ``Contact``, such as ``cohesion`` and ``leak``, at their defaults only.
 
     Raises:
@@ -118,7 +118,7 @@ class GeneralContact(OfProblem, given.Sealed):
             self.heats = conductances_of(heat)
             self.normal = given_normal(normal, friction, 0.0, self.heats, False)
             law = as_law(friction if self._pairs is None else self._pairs.law)
-            self.edges = given_edges(edges, self.coupling, self.normal, self.heats, law)
+            self.edges = given_edges(edges, self.normal, self.heats, law)
             if any(law.temperature is not None for law in self.heats) and not self.rigid:
                 raise InputError("heat: temperature is of rigid surfaces, and there are none: leave it out, or give rigid=...")
         self.surfaces, self.bodies, self.friction, self.heat = surfaces, dict(bodies or {}), friction, heat
@@ -225,17 +225,23 @@ class GeneralContact(OfProblem, given.Sealed):
         self, nodes: Indices, place: Ints, itself: Bools, apart: Sequence[Apart], bound: float, options: dict[str, Any]
     ) -> list[Contact]:
         """Mortar contacts with each target body (collective); arguments as for ``_nodes``."""
+        from uem_dolfinx.contact.general.edges import crossings_of, edge_contacts
         from uem_dolfinx.contact.general.mortar import Body
         from uem_dolfinx.geometry.faces import classes_of_facets, facets_by_class, surface_of
+        from uem_dolfinx.geometry.neighbours import Neighbours
 
         skin, found, order = self._skin, list[Contact](), np.argsort(place)
+        # which bodies may touch; nodes are searched by each body
+        neighbours = Neighbours(skin, nodes[:0], place, apart, bound, 0, itself)
+        crossings = crossings_of(neighbours, bound, ridges=True) if self.edges else None
         classes = classes_of_facets(skin)
         for body in order[skin.size[order] > 0].tolist():
             tag = surface_of(skin, skin.body == body)
             target = Body(skin, TargetFacets(self._config, tag), body, apart, bound)
             for contactor in facets_by_class(skin, *classes, place[skin.body] < place[body]):
-                found.append(MortarContact(contactor, tag, target, name=self._name(len(found)), **options))
-        return found
+                name = self._name(len(found))
+                found.append(MortarContact(contactor, tag, target, crossings, neighbours.number, name=name, **options))
+        return [*found, *([] if crossings is None else edge_contacts(neighbours, crossings, self.name, options))]
 
     def _name(self, k: int) -> str:
         """Name of the k-th contact between bodies."""

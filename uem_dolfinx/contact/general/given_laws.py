@@ -42,15 +42,13 @@ def refuse_words_of_contact(others: Mapping[str, Any]) -> None:
             )
 
 
-def given_edges(
-    edges: bool | None, coupling: str, normal: SoftContact | None, heats: Sequence[Conductance], law: FrictionLaw
-) -> bool:
+def given_edges(edges: bool | None, normal: SoftContact | None, heats: Sequence[Conductance], law: FrictionLaw) -> bool:
     """Whether edges that cross are held apart.
 
     Raises:
         InputError, InputTypeError: if that does not go with the other arguments, or for another value.
     """
-    others: dict[str, Any] = {"coupling": coupling if coupling != "node_to_surface" else None, "normal": normal}
+    others: dict[str, Any] = {"normal": normal}
     others |= {"heat": heats or None, "friction": law if law.per_area else None}
     wrong = {word: value for word, value in others.items() if value is not None}
     if edges is None:

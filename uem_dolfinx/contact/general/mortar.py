@@ -88,7 +88,8 @@ class AmongBodiesMortar(Mortar):
         assert isinstance(found.nearest, FacetProjection)
         # at a sharp edge, a node counts only for faces that are covered by the body
         out = self._at_edge | self.target.excluded(self.nodes, found.nearest.facet)
-        return replace(found, out=out & ~found.rows.covered)
+        out &= ~found.rows.covered
+        return replace(found, out=out if found.out is None else out | found.out)
 
     def told(self, facets: Ints) -> Array:
         """Visibility keys of contactor facets, see ``Body.allowed`` ``(m, k)``."""

@@ -185,9 +185,9 @@ class AmongContact(BodiesContact):
 class MortarContact(BodiesContact):
     """Part of a general contact: one target body with the facets, on smooth faces, of all bodies that follow it."""
 
-    def __init__(self, contactor: Tag, target: Tag, body: Body, **options: Any):
+    def __init__(self, contactor: Tag, target: Tag, body: Body, crossings: Crossings | None, order: int, **options: Any):
         super().__init__(contactor, target, coupling="mortar", **options)
-        self._body, self._skin = body, body.skin
+        self._body, self._skin, self._crossings, self._order = body, body.skin, crossings, order
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         return surface_nodes(config, self.contactor), self._body
@@ -197,7 +197,17 @@ class MortarContact(BodiesContact):
         from uem_dolfinx.contact.general.mortar import AmongBodiesMortar
 
         surface = TargetFacets(self.config, self.contactor, "contactor")
-        return AmongBodiesMortar(self.config, nodes, target, surface=surface, of_gaps=self.normal is not None, **how), None
+        found = AmongBodiesMortar(self.config, nodes, target, surface=surface, of_gaps=self.normal is not None, **how)
+        crossings, body = self._crossings, self._body
+
+        def at_crossings(_: FacetProjection) -> Bools:
+            """Which nodes are at crossings of edges with the body (collective)."""
+            assert crossings is not None
+            return crossings.hold(nodes, np.full(len(nodes), body.number), body.skin.n_bodies)
+
+        if crossings is not None:
+            found.leave(at_crossings, self._order)
+        return found, None
 
     def edges_that_meet(self) -> Meeting:
         """Sharp edges of all bodies, without self-contact."""

@@ -107,7 +107,7 @@ class Mortar(Contactors):
         movable = np.linalg.norm(seen.normal * self.free, axis=1) > MOSTLY_PRESCRIBED
         if self.setting.prescribed:
             movable |= self._can_move(rows.plain)
-        return MortarKinematics(self, points, seen, nearest, gap, rows, movable)
+        return MortarKinematics(self, points, seen, nearest, gap, rows, movable, self.left(nearest))
 
     def _can_move(self, equations: UnitingEquations) -> Bools:
         """Contactors whose equations contain a free component of a followed node (collective)."""

@@ -6,10 +6,10 @@ contactor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -46,7 +46,6 @@ class NodeToSurface(OnTarget):
     #: In place of ``ConcaveEdges``, see ``follow_by``.
     _edges: Any = None
     #: Which contactors are left to other equations, see ``leave``.
-    _leaves: Sequence[Callable[[FacetProjection], Bools]] = ()
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -80,8 +79,8 @@ class NodeToSurface(OnTarget):
         self._followed, self._may_move = np.zeros((0, 0), np.int64), np.zeros((0, 0, 0))
 
     def leave(self, which: Callable[[FacetProjection], Bools], order: int, *, ends_hold: bool | None = None) -> None:
-        """Leave contactors, ``which (n,)`` by their projection (collective), to another contact; both share an order of bodies."""
-        self._leaves, self.traits = [*self._leaves, which], self.traits._replace(order=order)
+        """See ``OnTarget``; ``ends_hold`` replaces that of the nodes unless it is None."""
+        super().leave(which, order)
         self.ends_hold = self.ends_hold if ends_hold is None else ends_hold
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
@@ -100,10 +99,10 @@ class NodeToSurface(OnTarget):
             else:
                 nearest = projection = self.on_target(points, self.anchor)
         moves = self._target_moves(projection) if self.setting.prescribed else None
-        left = [which(cast("FacetProjection", nearest)) for which in self._leaves]
+        out = self.left(nearest)
         if not self.setting.on.all():
-            left.append(~self.setting.on[self.setting.label])
-        out = np.any(left, axis=0) if left else None
+            off = ~self.setting.on[self.setting.label]
+            out = off if out is None else out | off
         return self.measured(NodalKinematics(self, points, projection, nearest, projection.gap, corners, moves, out=out), state)
 
     def _asks(self, state: PairState) -> bool:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 from mpi4py import MPI
 
@@ -42,6 +42,7 @@ class OnTarget:
     """
 
     traits: Traits
+    _leaves: Sequence[Callable[[FacetProjection], Bools]] = ()
 
     def __init__(
         self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf,
@@ -69,6 +70,15 @@ class OnTarget:
         if changed.keys() & {"far", "offset"}:
             self._projected = self._at_feet = None
         self.setting = self.setting._replace(**changed)
+
+    def leave(self, which: Callable[[FacetProjection], Bools], order: int) -> None:
+        """Leave contactors, ``which (n,)`` by their projection (collective), to another contact; both share an order of bodies."""
+        self._leaves, self.traits = [*self._leaves, which], self.traits._replace(order=order)
+
+    def left(self, nearest: Projection) -> Bools | None:
+        """Contactors that are left to other contacts ``(n,)``, by their nearest facets; None without (collective)."""
+        left = [which(cast("FacetProjection", nearest)) for which in self._leaves]
+        return np.any(left, axis=0) if left else None
 
     @property
     def offset(self) -> Array | None:
