@@ -21,7 +21,7 @@ from uem_dolfinx.accuracy.enriched import Enriched
 from uem_dolfinx.accuracy.enriched_curvature import Side, curvature
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.pair.interface import table_of
+from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets, unit
 from uem_dolfinx.geometry.shapes import area_vectors, facet_shape
 from uem_dolfinx.parallel import gathered

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.pair.interface import Interface, name_at
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import name_at
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError

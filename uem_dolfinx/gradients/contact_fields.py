@@ -11,7 +11,7 @@ from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.nodes.bernstein import Bernstein
-from uem_dolfinx.contact.pair.interface import table_of
+from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.gradients.parameters import contactors_of, keeps_distance, rubbed, rubbed_along, thickened
 from uem_dolfinx.solve.problem import UnitedProblem

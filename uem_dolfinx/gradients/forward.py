@@ -17,7 +17,8 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.pair.interface import Interface, table_of
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.dynamics.rate_slopes import RateChanges
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of

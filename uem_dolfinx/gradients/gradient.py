@@ -20,6 +20,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import is_of_position
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
+from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.form_checks import Control, check_expression, check_functional, check_parts
 from uem_dolfinx.geometry.axisymmetry import revolved
@@ -401,7 +402,7 @@ def _check_shape(problem: UnitedProblem) -> None:
     config = problem.config
     if not Places(config).known:
         raise InputError("a gradient by the shape needs straight cells, or cells of the displacement's degree")
-    if any(pair.discretisation.traits.sliding != "finite" for pair in problem.pairs):
+    if not all(map(slides, problem.pairs)):
         raise InputError(
             "a gradient by the shape needs contacts of sliding='finite': others keep where they were projected at first"
         )

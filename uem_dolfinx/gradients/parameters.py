@@ -16,7 +16,8 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.friction.sliding import Sliding
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.mortar.placement import MortarKinematics
-from uem_dolfinx.contact.pair.interface import Interface, in_question, table_of
+from uem_dolfinx.contact.pair.interface import Interface, in_question
+from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.contact.seam.state import PairState

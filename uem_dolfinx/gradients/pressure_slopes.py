@@ -19,7 +19,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.pair.interface import table_of
+from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.parallel import reduced

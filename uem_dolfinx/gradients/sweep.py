@@ -26,7 +26,7 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.pair.interface import table_of
+from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
 from uem_dolfinx.errors import InputError
@@ -74,7 +74,7 @@ class Sweep:
         step = LinearisedStep(self.problem, record, self._derivatives, self._rates)
         with step:
             at_end = self._by_anchors
-            handed, self._by_anchors = step.handed_back(at_end)
+            handed, self._by_anchors = _back(self.problem, at_end, step.slopes)
             load = (handed + self._by_openings()).ravel()
             if self._rates is not None:
                 self._begin_rates(self._rates, J)
@@ -302,10 +302,6 @@ class LinearisedStep(Linearised):
             self.damped = damped_by(self.problem, self.derivatives, a)
             found.array[:] += self._rates.beyond_tangent(np.array(a.array_r), self.damped)
         return found
-
-    def handed_back(self, by_anchors: list[Array]) -> tuple[Any, list[Array]]:
-        """Derivatives by final positions, from derivatives by final anchors, and by the anchors that are unchanged (collective)."""
-        return _back(self.problem, by_anchors, self.slopes)
 
     def by_anchors(self, adjoint: Adjoint, kept: list[Array]) -> list[Array]:
         """Derivatives by the initial anchors of the step, including unchanged anchors (collective)."""

@@ -22,6 +22,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration
@@ -66,7 +67,7 @@ def refuse_passages(
     """
     du = config.displacement - config.of(start)
     # nothing that could pass is on an empty list
-    may = [pair.discretisation.traits.sliding == "finite" and (pair.asked or not _listed(pair.target)) for pair in pairs]
+    may = [slides(pair) and (pair.asked or not _listed(pair.target)) for pair in pairs]
     looked_at = list(compress(zip(pairs, motions), may))
     ways = [_ways(pair, du, motion) for pair, motion in looked_at]
     # for each contact: the longest displacements of both sides, the sum of the target's displacements and their number

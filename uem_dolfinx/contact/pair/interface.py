@@ -6,7 +6,6 @@ The trial state changes in every iteration, the committed state only after conve
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,8 +92,9 @@ class Interface:
         finite, error = np.isfinite(p.gap) & np.isfinite(p.normal).all(axis=1), None
         if not finite.all():
             i = int(np.argmin(finite))
+            name = self.members[self.discretisation.setting.label[i]].name
             error = NotFiniteError(
-                f"{name_at(self, i)}: gap {p.gap[i]}, normal {p.normal[i]} at {self.config.describe(int(self.nodes[i]))}: "
+                f"{name}: gap {p.gap[i]}, normal {p.normal[i]} at {self.config.describe(int(self.nodes[i]))}: "
                 "distance and gradient of the target must be finite, and the gradient must not vanish, near the contactors"
             )
         agree(self.config.comm, error)
@@ -421,18 +421,6 @@ class Interface:
         """Arrays ``(n, ...)`` for checkpoints, with facets as keys independent of the partition (collective)."""
         kept = self.committed.to_checkpoint(self.target.keys_of)
         return kept if self.tie is None else kept | self.tie.to_checkpoint()
-
-
-def name_at(pair: Interface, i: int) -> str:
-    """Name of the contact of a contactor."""
-    return str(pair.members[pair.discretisation.setting.label[i]].name)
-
-
-def table_of(pair: Interface) -> tuple[Interface, slice]:
-    """The interface in use that contains the contactors of a contact's, and their rows in it."""
-    whole = pair.whole
-    first = sum(len(one.nodes) for one in takewhile(lambda one: one is not pair, whole.members))
-    return whole, slice(first, first + len(pair.nodes))
 
 
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:

@@ -12,6 +12,7 @@ from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.joined_nodes import JoinedLaw
+from uem_dolfinx.contact.pair.tables import label_of
 from uem_dolfinx.contact.seam.corners import Corners
 from uem_dolfinx.contact.seam.placement import Kinematics
 from uem_dolfinx.contact.seam.state import PairState
@@ -154,5 +155,5 @@ class Member(Interface):
         assert self.friction is not None
         self.friction.set(law, value)
         own = [pair.friction for pair in self.joined.members if pair.friction is not None]
-        every = JoinedLaw([one.limits.law for one in own], self.joined.discretisation.setting.label)
+        every = JoinedLaw([one.limits.law for one in own], label_of(self.joined))
         self.joined.set_friction(every, np.concatenate([one.value for one in own]), known)

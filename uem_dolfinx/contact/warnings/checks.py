@@ -15,7 +15,8 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.pair.interface import Interface, name_at
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import name_at
 from uem_dolfinx.contact.seam.active_set import TOUCHING
 from uem_dolfinx.errors import ConflictError, ConvergenceError, OverdeterminedError, PenetrationError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration

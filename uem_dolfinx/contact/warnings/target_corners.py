@@ -17,6 +17,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import label_of
 from uem_dolfinx.contact.seam.active_set import TIED
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -130,7 +131,7 @@ class TargetCorners:
         if not checked.any():
             return {}
         near, label = self._near(checked)
-        pressing = sums_of_rows(whole.discretisation.setting.label, whole.trial.lam[:, None], n)[:, 0]
+        pressing = sums_of_rows(label_of(whole), whole.trial.lam[:, None], n)[:, 0]
         some, force = reduced(comm, np.stack([np.bincount(label, minlength=n), pressing]))
         # separating bodies have small forces, so that the largest so far counts
         self.largest[checked] = np.maximum(force, self.largest)[checked]
@@ -139,10 +140,7 @@ class TargetCorners:
         # a corner near a contactor is no deeper than its distance from it
         least = ON_FACET * float(self.smallest[checked].min())
         away = 4.0 * config.size * np.arange(1, n + 1)
-        places, points = (
-            np.column_stack([x, away[k]])
-            for x, k in ((config.x[near], label), (whole.points, whole.discretisation.setting.label))
-        )
+        places, points = (np.column_stack([x, away[k]]) for x, k in ((config.x[near], label), (whole.points, label_of(whole))))
         distance, _ = nearest_of(comm, places, points, least, np.zeros((len(points), 1)))
         near, label = near[distance > least], label[distance > least]
         if not reduced(comm, len(near)):
@@ -186,7 +184,7 @@ class TargetCorners:
     def _near(self, checked: Bools) -> tuple[Indices, Ints]:
         """Corners inside the box around contactors within one facet size of the target, and their contacts (collective)."""
         whole, config, g = self.whole, self._config, self._config.gdim
-        points, label = whole.points, whole.discretisation.setting.label
+        points, label = whole.points, label_of(whole)
         near = checked[label] & (np.linalg.norm(points - whole.kinematics.projection.foot, axis=1) <= self.reach[label])
         bounds = np.full((len(self.pairs), 2 * g), -np.inf)
         np.maximum.at(bounds, label[near], np.column_stack([-points, points])[near])

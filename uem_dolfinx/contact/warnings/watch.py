@@ -11,6 +11,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.both_sides import OfBothSides
+from uem_dolfinx.contact.pair.tables import contacts_with
 from uem_dolfinx.contact.warnings.checks import sagging, warn_of_sagging_facets, warn_of_slipped
 from uem_dolfinx.errors import OrientationError, UEMError
 from uem_dolfinx.geometry.facets import facets_of
@@ -213,9 +214,7 @@ class Watch:
             return
         whole = group[0].pair.whole
         gone = whole.off & ~self._off_at_start[id(whole)] & ~whole.tied
-        some = dict(
-            zip(map(id, whole.members), np.bincount(whole.discretisation.setting.label[gone], minlength=len(whole.members)) > 0)
-        )
+        some = dict(zip(map(id, whole.members), contacts_with(whole, gone)))
         mine = np.array([some[id(c.pair)] for c in group])
         for contact, some in zip(group, reduced(whole.config.comm, mine, op=MPI.LOR)):
             if some:
@@ -255,8 +254,7 @@ def _warn_of_sagging_facets(group: Sequence[WatchedContact]) -> None:
     whole = group[0].pair.whole
     some = np.ones(len(whole.members), dtype=bool)
     if len(some) > 1:
-        near = np.bincount(whole.discretisation.setting.label[sagging(whole)[0]], minlength=len(some)) > 0
-        some = reduced(whole.config.comm, near, op=MPI.LOR)
+        some = reduced(whole.config.comm, contacts_with(whole, sagging(whole)[0]), op=MPI.LOR)
     near_pairs = {id(member) for member, one in zip(whole.members, some) if one}
     for contact in group:
         if id(contact.pair) in near_pairs:

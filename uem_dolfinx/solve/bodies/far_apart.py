@@ -15,6 +15,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import contacts_with, slides
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.search import MeshTarget
 
@@ -105,8 +106,7 @@ class FarApart:
         more[0] = [0.0 if offset is None else offset.max(initial=0.0) for offset in offsets]
         # contacts with active contactors, or contactors past an end, are searched
         for place, p in zip(self._places, self._wholes):
-            used = p.trial.active | p.trial.passed | p.trial.barred
-            more[1, place[p.discretisation.setting.label[used]]] = 1.0
+            more[1, place] = contacts_with(p, p.trial.active | p.trial.passed | p.trial.barred)
         self._boxes, (offset, used) = self._look(self._config.x, more)
         self._near = self._reach + offset
         far = (used == 0.0) & (self._boxes.apart > self._near)
@@ -188,9 +188,4 @@ class FarApart:
 
 def _may_be_far(pair: Interface) -> bool:
     measured = pair.discretisation.traits.at_feet and getattr(pair.target, "measures", False)
-    return (
-        measured
-        and pair.discretisation.traits.sliding == "finite"
-        and pair.tie is None
-        and not (pair.heats or pair.trial.has_law)
-    )
+    return measured and slides(pair) and pair.tie is None and not (pair.heats or pair.trial.has_law)

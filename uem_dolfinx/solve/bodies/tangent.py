@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
@@ -197,7 +198,7 @@ def curvature_of(
         states: whose forces act; None for the trial states.
     """
     found = zip(pairs, states or [pair.trial for pair in pairs])
-    moving = [(pair, state) for pair, state in found if pair.discretisation.traits.sliding == "finite"]
+    moving = [(pair, state) for pair, state in found if slides(pair)]
     if not moving and linear is None:
         return None
     parts = [part for pair, state in moving for part in pair.curvature(state)]

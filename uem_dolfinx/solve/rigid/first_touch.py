@@ -10,6 +10,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.pair.interface import Interface, in_question
+from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.contact.seam import active_set
 from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.geometry.configuration import Configuration
@@ -85,11 +86,7 @@ def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[
         config: configuration of the displacement.
         pairs: of all contacts.
     """
-    moving = [
-        pair.target
-        for pair in pairs
-        if pair.discretisation.traits.sliding == "finite" and pair.target.n_nodes and pair.tie is None
-    ]
+    moving = [pair.target for pair in pairs if slides(pair) and pair.target.n_nodes and pair.tie is None]
     facets = list({id(target.dofs): target.dofs for target in moving}.values())
     every = np.arange(config.n_local)
 

@@ -23,7 +23,8 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.pair.interface import Interface, name_at
+from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.tables import label_of, name_at
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Pivoting, Rule, Violations
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import ConvergenceError, FrictionError
@@ -288,7 +289,7 @@ class Exchanges:
         config = self._pairs[0].config
         along = [pair.config.X[pair.nodes] @ ALONG[: config.gdim] for pair in self._pairs]
         first = np.cumsum([0, *(len(pair.members) for pair in self._pairs)])
-        label, least = [k + pair.discretisation.setting.label for k, pair in zip(first, self._pairs)], np.full(first[-1], np.inf)
+        label, least = [k + label_of(pair) for k, pair in zip(first, self._pairs)], np.full(first[-1], np.inf)
         for which, w, a in zip(label, violated, along):
             np.minimum.at(least, which, np.where(w.which, a, np.inf))
         config.comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
