@@ -18,9 +18,18 @@ def condition_number(matrix: PETSc.Mat) -> float:
     return largest / smallest
 
 
+def of_sparse(A: csr_matrix) -> float:
+    """The condition number of a matrix of SciPy."""
+    largest, smallest = _extremes(A)
+    return largest / smallest
+
+
 def extreme_eigenvalues(matrix: PETSc.Mat) -> tuple[float, float]:
     """Largest and smallest magnitude of the eigenvalues, without idle unknowns, which nothing but their own diagonal is left of."""
-    A = _sparse(matrix)
+    return _extremes(_sparse(matrix))
+
+
+def _extremes(A: csr_matrix) -> tuple[float, float]:
     idle = np.asarray(np.abs(A - diags(A.diagonal())).sum(axis=1)).ravel() == 0
     A = A[~idle][:, ~idle].tocsc()
     solver = splu(A)

@@ -5,6 +5,7 @@ Read first: ``test_effectivity``.
 
 from __future__ import annotations
 
+import logging
 from functools import cache
 
 from mpi4py import MPI
@@ -218,6 +219,16 @@ def test_effectivity(scene, n, degree, coupling, finer):
         assert np.isclose(found.value, value(J), rtol=1e-12)
         ratio = found.error / (exact(scene)[name] - found.value)
         assert 0.5 < ratio < 1.5, (name, ratio)
+
+
+def test_few_facets_in_contact(caplog):
+    """A warning where contact ends within a facet or two, and none where it has four, or covers the surface."""
+    for scene, n, few in (("tilted", 2, True), ("tilted", 8, False), ("sharp", 2, False)):
+        problem, goals = blocks(scene, n)
+        with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
+            caplog.clear()
+            uem.goal_error(problem, goals["displacement"])
+        assert COMM.bcast("facets are in contact" in caplog.text) == few
 
 
 @cache

@@ -24,11 +24,15 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets, unit
 from uem_dolfinx.geometry.shapes import area_vectors, facet_shape
-from uem_dolfinx.parallel import gathered
+from uem_dolfinx.log import logger
+from uem_dolfinx.parallel import gathered, reduced
 
 #: Pieces of a rule along each side of a contactor facet, on which kinks of the target lie anywhere.
 #: [bound; pieces; test_goal.py::test_effectivity]
 PIECES = 4
+#: With fewer facets in contact along each direction of the surface, the solution of one degree more has another contact.
+#: [convention; facets; test_goal.py::test_few_facets_in_contact]
+FEW = 3
 
 
 class EnrichedRows(NamedTuple):
@@ -70,6 +74,7 @@ def enriched_rows(enriched: Enriched) -> EnrichedRows:
     first = np.append(0, np.cumsum(gathered(comm, sum(len(one.nodes) * one.width for one in surfaces))))
     at = int(first[comm.rank])
     for one in surfaces:
+        one.warn_of_few()
         count = len(one.nodes) * one.width
         parts.append(one.entries(at))
         states.append((np.repeat(one.active, one.width), np.repeat(one.tied, one.width)))
@@ -116,6 +121,10 @@ class _Surface:
             state[pair.nodes, 3:] = (friction.value[:, None] * friction.directions(whole.trial))[rows]
         of_facets = self._of_nodes(state)
         whole = of_facets[:, :, :2].min(axis=1, initial=1.0)
+        active = of_facets[:, :, 0] > 0
+        #: Numbers of all facets with an active contactor, and of those whose contactors are all active.
+        self.touched, self.closed = reduced(config.comm, np.array([active.any(axis=1).sum(), active.all(axis=1).sum()]))
+        self.count = reduced(config.comm, len(whole))
         #: Of each facet, a mean of mu s over the contactors that slip ``(m, gdim)``.
         self.rubbing = of_facets[:, :, 3:].sum(axis=1) / np.maximum(of_facets[:, :, 2].sum(axis=1), 1.0)[:, None]
         there, active, tied = (
@@ -125,6 +134,16 @@ class _Surface:
         self.nodes = np.flatnonzero(there)
         self.active: Bools = active[self.nodes]
         self.tied: Bools = tied[self.nodes]
+
+    def warn_of_few(self) -> None:
+        """Warn if contact begins and ends within a few facets; where all of them are in contact, or tied, its ends are known."""
+        few = FEW ** (self.enriched.problem.config.tdim - 1)
+        if self.closed < few and self.touched and self.closed < self.count:
+            logger.warning(
+                "contact '%s': %d facets are in contact, expected %d at least: the goal's estimate may be off by a factor of five, "
+                "or have the wrong sign; refine the contactor there",
+                self.contact.name, self.closed, few,
+            )  # fmt: skip
 
     def _dofs(self, tag: Any) -> Indices:
         """Local nodes of the enriched space on this rank's facets ``(m, nn)``."""
