@@ -261,6 +261,23 @@ def test_a_rigid_block_without_stiffness(side):
     assert push[1] == pytest.approx(-0.02, rel=1e-8) and turn == pytest.approx(0.001, rel=1e-7)
 
 
+@pytest.mark.parametrize("how", [{}, slow({"petsc_options": {"ksp_type": "cg", "pc_type": "hypre"}})])
+def test_moments_about_fixed_axes(how):
+    """The end of a bar turns by more than a right angle about three axes: quadratic convergence, and the same end whatever the steps."""
+    ends = []
+    for n in (3, 5):
+        b = Bar("hexahedron")
+        moment = fem.Constant(b.scene.mesh, np.zeros(3))
+        coupling = uem.RigidCoupling(b.right, b.point, moment=moment, rotations="large")
+        problem = b.problem(coupling, law=st_venant, load={moment: np.array([0.03, 0.04, -0.02])}, rtol=1e-10, **how)
+        for step in uem.load_steps(problem, n):
+            left = [one.residual for one in step.iterations]
+            assert len(left) <= 9 and left[-1] <= 1e-2 * left[-2] <= 1e-4 * left[-3], left
+        ends.append(coupling.rotation)
+    assert np.linalg.norm(ends[0]) > np.pi / 2
+    np.testing.assert_allclose(*ends, rtol=1e-7)
+
+
 def test_rigid_bodies_on_each_other():
     """Flat on flat more contactors touch than two bodies have motions: what they carry together is the load, and where it acts."""
     b = blocks(COMM, "quadrilateral", 2, 3)

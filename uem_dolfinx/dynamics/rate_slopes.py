@@ -184,5 +184,5 @@ class RateChanges(RateSlopes):
     def end(self, u: Array) -> None:
         """Compute changes of the final state, with that of the final displacement (collective)."""
         du = u - self.by.u
-        rates = (self._after(rows, du) for rows in (self._v, self._a, self._w))
-        self.by = ByState(u, *rates, self._forces(du))
+        v, a, w = (self._after(rows, du) for rows in (self._v, self._a, self._w))
+        self.by = ByState(u, v, a, w, self._forces(du))

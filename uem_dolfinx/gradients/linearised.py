@@ -62,12 +62,12 @@ from uem_dolfinx.gradients.parameters import (
 from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
 from uem_dolfinx.gradients.refused import refuse_sharp
-from uem_dolfinx.gradients.rigid_slopes import Followers, RigidSlopes, shape_slopes_of, skew_curvature
+from uem_dolfinx.gradients.rigid_slopes import Followers, RigidSlopes, shape_slopes_of
 from uem_dolfinx.gradients.shape_slopes import ShapeSlopes
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.norms import ratio
-from uem_dolfinx.solve.bodies.tangent import curvature_of, slip_terms, together
+from uem_dolfinx.solve.bodies.tangent import curvature_of, is_skew, slip_terms, together
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.taken import in_rows, uniform, wanted_by_step
 from uem_dolfinx.solve.united.rows import BodyState, Rows
@@ -151,10 +151,9 @@ class Linearised:
         # in addition to the curvature, springs between couplings
         self.K, self.G = self.problem.bodies.tangent.K, together(system.curvature, state.added)
         self._K_back = self.K if is_symmetric(self.K, self.config.unknowns) else transposed(self.K)
-        if (skew := None if self.problem.linear is None else skew_curvature(self.problem.linear, self.vector())) is not None:
-            self.G = together(self.G, skew)
-            self.problem.solver.set_operator(self.P, self.K, self.G)
-        self._G_back = self.G if skew is None else transposed(self.G)
+        turning = [] if self.problem.linear is None else self.problem.linear.curvature()
+        skew = reduced(self.config.comm, int(any(is_skew(blocks) for _, blocks in turning)))
+        self._G_back = transposed(self.G) if skew else self.G
         self._tell_idle()
 
     def _state(self) -> BodyState:

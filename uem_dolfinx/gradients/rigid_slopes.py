@@ -15,9 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from petsc4py import PETSc
 
-from uem_dolfinx.algebra.entries import SYMMETRIC
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.conditions.rigid_rows import RigidRows
 from uem_dolfinx.conditions.rigid_set import moments, turned
@@ -26,7 +24,6 @@ from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.gradients.shape_slopes import ShapeSlopes, of_equations, of_tie
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.bodies.tangent import contact_curvature
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.rows import Rows
 
@@ -117,15 +114,6 @@ def shape_slopes_of(problem: UnitedProblem, equations: Sequence[ContactRows]) ->
             found.append((slice(first, first + n), rigid))
             first += n
     return found
-
-
-def skew_curvature(users: UserRows, like: PETSc.Vec) -> PETSc.Mat | None:
-    """Skew part of the curvature of couplings, of moments whose axes do not turn with the part, which steps neglect (collective)."""
-    whole = users.curvature()
-    parts = [(nodes, 0.5 * (blocks - blocks.transpose(0, 2, 1))) for nodes, blocks in whole]
-    size = [(np.abs(skew).max(initial=0.0), np.abs(blocks).max(initial=0.0)) for (_, blocks), (_, skew) in zip(whole, parts)]
-    there = reduced(like.comm.tompi4py(), int(any(skew > SYMMETRIC * largest for skew, largest in size)))
-    return contact_curvature(parts, like) if there else None
 
 
 class Followers:

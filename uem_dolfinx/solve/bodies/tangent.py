@@ -17,6 +17,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
+from uem_dolfinx.algebra.entries import SYMMETRIC
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import slides
@@ -179,6 +180,12 @@ def convex_part(blocks: Array) -> Array:
     return out
 
 
+def is_skew(blocks: Array) -> bool:
+    """Whether blocks ``(k, n, n)`` have a skew part that is more than rounding."""
+    skew = np.abs(blocks - blocks.transpose(0, 2, 1)).max(initial=0.0)
+    return bool(skew > SYMMETRIC * np.abs(blocks).max(initial=0.0))
+
+
 def curvature_of(
     pairs: Sequence[Interface],
     du: PETSc.Vec,
@@ -192,7 +199,7 @@ def curvature_of(
     Args:
         pairs: of all contacts.
         du: a vector with the displacement's layout.
-        apart: whether P differs from Q; otherwise only the symmetric part is used.
+        apart: whether P differs from Q; otherwise only the symmetric part is used, but of moments whose axes do not turn with a part.
         convex: whether terms that could make the tangent indefinite are neglected.
         linear: equations of users, or None.
         states: whose forces act; None for the trial states.
@@ -202,11 +209,13 @@ def curvature_of(
     if not moving and linear is None:
         return None
     parts = [part for pair, state in moving for part in pair.curvature(state)]
+    contacts = len(parts)
     parts += [] if linear is None else linear.curvature()
     for i, (nodes, blocks) in enumerate(parts):
         # in place, to save memory
         blocks = convex_part(blocks) if convex else blocks
-        parts[i] = nodes, blocks if apart else 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        whole = apart or (i >= contacts and not convex and is_skew(blocks))
+        parts[i] = nodes, blocks if whole else 0.5 * (blocks + blocks.transpose(0, 2, 1))
     # it vanishes e.g. for a plane
     if not reduced(du.comm.tompi4py(), any(blocks.any() for _, blocks in parts)):
         return None
