@@ -313,6 +313,19 @@ def test_steps_that_switch_one(monkeypatch):
     assert np.abs(one - other).max() <= 1e-10 * np.abs(other).max() and (one[:, 1] == 0.0).all(axis=1).any()
 
 
+def test_a_goal_of_several(monkeypatch):
+    """The error of a functional, with contactors that stick and slip, is that of contacts that are treated alone."""
+    found = []
+    for together in (True, False):
+        if not together:
+            one_by_one(monkeypatch)
+        _, problem = stacks(2, mu=0.2)
+        problem.solve()
+        error = uem.goal_error(problem, problem.u[0] * ufl.dx)
+        found.append([error.value, error.error, error.parts])
+    assert found[0] == pytest.approx(found[1], rel=1e-9) and abs(found[0][1]) > 1e-9
+
+
 def test_facets_keep_their_numbers():
     """A contact's facets are numbered as by its target alone, in states and projections."""
     contacts, problem = stacks(3)

@@ -77,7 +77,7 @@ class AnchorSlopes:
         c = np.where(self._slips, bound / np.where(way > 0.0, way, 1.0), 0.0)
         assert state.friction is not None
         q = c[:, None] * w - self._sliding.frame.tangential(state.friction.tau)
-        self._sliding.pivot = replace(self._sliding.pivot, stiffness=c, q=q)
+        self._pair.take(state, replace(self._sliding.pivot, stiffness=c, q=q))
 
     def turned(self, state: PairState) -> list[tuple[Ints, Array]]:
         """Terms of slip with the forces of a state, lists of global nodes and blocks as in ``Interface.curvature`` (collective).

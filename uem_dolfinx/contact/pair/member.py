@@ -32,8 +32,8 @@ class Member(Interface):
         self.joined, self._k, self._rows = whole, k, whole.discretisation.rows_of[k]
         self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
         self.name, self.max_penetration, self.tie, self.heats = own.name, own.max_penetration, None, []
-        self._known: tuple[Kinematics, PairState, Kinematics] | None = None
-        #: The last trial state of all contacts that was looked at, and its part.
+        #: The last kinematics, and the last trial state, of all contacts that were looked at, and their parts.
+        self._known: tuple[Kinematics, Kinematics] | None = None
         self._seen: tuple[PairState, PairState] | None = None
 
     @property
@@ -63,15 +63,10 @@ class Member(Interface):
     def committed(self, state: PairState) -> None:
         self.joined.committed = self.joined.with_state_of(self._k, self.joined.committed, state)
 
-    @property
-    def united(self) -> Bools:
-        """Contactors that are active ``(n,)``."""
-        return self.joined.trial.active[self._rows]
-
     def largest_gap_here(self) -> float:
         """Largest gap of an active contactor of this rank, or distance from its anchor, a length."""
         whole = self.joined
-        here = float(np.abs(self.kinematics.gap[self.united & ~whole.trial.redundant[self._rows]]).max(initial=0.0))
+        here = float(np.abs(self.kinematics.gap[self.trial.active & ~self.trial.redundant]).max(initial=0.0))
         if whole.friction is None:
             return here
         return max(here, float(whole.friction.distances(whole.trial)[self._rows].max(initial=0.0)))
@@ -104,8 +99,8 @@ class Member(Interface):
         """Kinematics of its contactors, made at the first access."""
         whole: Any = self.joined.kinematics
         if self._known is None or self._known[0] is not whole:
-            self._known = whole, self.joined.trial, self._kinematics_of(whole)
-        return self._known[2]
+            self._known = whole, self._kinematics_of(whole)
+        return self._known[1]
 
     def _kinematics_of(self, whole: Any) -> Kinematics:
         some, points = self._rows, whole.points[self._rows]
