@@ -123,14 +123,6 @@ class JoinedTarget(MeshTarget):
         super().__init__(facets, averaged)
         self._surface, self.asked = surface, np.ones(len(surface), dtype=bool)
 
-    def alone(self, facet: Ints, surface: int) -> Ints:
-        """See ``JoinedFacets``."""
-        return self.facets.alone(facet, surface)
-
-    def here(self, facet: Ints, surface: int) -> Ints:
-        """See ``JoinedFacets``."""
-        return self.facets.here(facet, surface)
-
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
         """Closest points of contactors on their own targets; ``nowhere`` for contactors that are skipped (collective)."""
         asked = self.asked if which is None else self.asked[which]

@@ -54,11 +54,6 @@ class JoinedMotion:
         return found
 
 
-def motions_of_each(motion: JoinedMotion | None, n: int) -> list[Motion | None]:
-    """Motions of the targets of n contacts that are treated as one; None for meshes."""
-    return [None] * n if motion is None else motion.each
-
-
 class JoinedRigid:
     """Implements ``Target``: rigid surfaces of many contacts, each met by its own contactors.
 

@@ -27,7 +27,6 @@ from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.crossings import Crossings, cross_target, entries_and_exits
-from uem_dolfinx.geometry.joined_rigid import motions_of_each
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
@@ -80,7 +79,7 @@ def refuse_passages(
         if longest <= pair.target.stride:
             continue
         if len(pair.members) > 1:
-            each: Any = motions_of_each(motion, len(pair.members))  # type: ignore[arg-type]
+            each = getattr(motion, "each", [None] * len(pair.members))
             on = pair.discretisation.setting.on
             refuse_passages(config, list(compress(pair.members, on)), start, list(compress(each, on)), moving)
             continue

@@ -36,7 +36,7 @@ class JoinedInterface(Interface):
         friction = JoinedSliding(sliding, nodal) if sliding else None
         super().__init__(first.config, nodal.nodes, nodal, friction, name=first.name, max_penetration=first.max_penetration)
         self._members: list[weakref.ref[Member]] = []
-        here, surface = nodal.target.here, nodal.surface_of
+        here, surface = nodal.numbers.here, nodal.surface_of
         parts = [_renumbered(p.committed, lambda f, s=s: here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
         self.trial = self.committed = _each(lambda _, *a: np.concatenate(a), *parts)
 
@@ -53,14 +53,14 @@ class JoinedInterface(Interface):
 
     def state_of(self, k: int, state: PairState) -> PairState:
         """A contact's part of a state, with its own numbers of facets."""
-        target, surface = self.discretisation.target, self.discretisation.surface_of[k]
+        numbers, surface = self.discretisation.numbers, self.discretisation.surface_of[k]
         own = self.discretisation.rows_of[k]
-        return _each(lambda name, a: target.alone(a[own], surface) if name in FACETS else a[own], state)
+        return _each(lambda name, a: numbers.alone(a[own], surface) if name in FACETS else a[own], state)
 
     def with_state_of(self, k: int, state: PairState, part: PairState) -> PairState:
         """The state with a contact's part."""
-        target, surface = self.discretisation.target, self.discretisation.surface_of[k]
-        return _with_rows(state, self.discretisation.rows_of[k], _renumbered(part, lambda facet: target.here(facet, surface)))
+        numbers, surface = self.discretisation.numbers, self.discretisation.surface_of[k]
+        return _with_rows(state, self.discretisation.rows_of[k], _renumbered(part, lambda facet: numbers.here(facet, surface)))
 
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""

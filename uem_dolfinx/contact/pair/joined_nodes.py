@@ -41,10 +41,12 @@ class JoinedNodes(NodeToSurface):
         distinct: dict[int, Any] = {id(surface): surface for surface in surfaces}
         #: Number of the surface of each contact.
         self.surface_of = [list(distinct).index(id(surface)) for surface in surfaces]
-        target: Any = JoinedRigid([one.target for one in own], self.rows_of)
+        #: Converts numbers of facets, ``alone`` on their surface and ``here``.
+        self.numbers: Any = JoinedRigid([one.target for one in own], self.rows_of)
+        target: Any = self.numbers
         if first.target.n_nodes:
-            facets = JoinedFacets(first.config, list(distinct.values()))
-            target = JoinedTarget(facets, first.target.averaged, np.array(self.surface_of)[label])
+            self.numbers = JoinedFacets(first.config, list(distinct.values()))
+            target = JoinedTarget(self.numbers, first.target.averaged, np.array(self.surface_of)[label])
         how: dict[str, Any] = {"free": first.setting.free, "sliding": first.sliding, "thickness": first.thickness}
         super().__init__(first.config, np.concatenate([one.nodes for one in own]), target, **how)
         self._own = own

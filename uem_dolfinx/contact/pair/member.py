@@ -115,7 +115,7 @@ class Member(Interface):
     def _alone(self, p: Any) -> Any:
         nodal = self.joined.discretisation
         parts = {f.name: v[self._rows] for f in fields(p) if isinstance(v := getattr(p, f.name), np.ndarray)}
-        parts["facet"] = nodal.target.alone(parts["facet"], nodal.surface_of[self._k])
+        parts["facet"] = nodal.numbers.alone(parts["facet"], nodal.surface_of[self._k])
         if isinstance(p, RigidProjection):
             parts["motion"] = self.target.motion
         return replace(p, **parts)
