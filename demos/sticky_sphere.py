@@ -66,7 +66,7 @@ def move(factor: float) -> None:
 
 sphere = uem.RigidParaboloid((0, -depth), (0, 1), R)
 law = uem.Adhesion(w, strength)
-contact = uem.Contact(tags["top"], sphere, cohesion=law, coupling=args.coupling, sliding="small", name="sphere")
+contact = uem.Contact(tags["top"], sphere, cohesion=law, coupling=args.coupling, name="sphere")
 bcs = [uem.dirichlet(V, tags["axis"], 0), uem.dirichlet(V, tags["bottom"], value=base)]
 F = uem.LinearElastic(E, nu, kind="axisymmetric").residual(u, v) * ufl.dx
 how = {"bcs": bcs, "contacts": [contact], "load": move, "max_iterations": 100, "petsc_options_prefix": "sticky_sphere_"}

@@ -154,3 +154,29 @@ def test_what_is_refused():
     b = blocks(COMM, "quadrilateral", 2, 3)
     refused(uem.InputError, "friction", lambda: uem.Contact(b.high, b.low, cohesion=uem.Adhesion(1.0, 1.0), friction=0.3))
     refused(uem.InputError, "strength", lambda: uem.Adhesion(1.0, 0.0))
+
+
+@pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron")])
+def test_the_tangent_by_mortar(cell):
+    """Across open gaps of arched surfaces that slide, stiffness and curvature are the derivative of the attraction."""
+    b = blocks(COMM, cell, 3, 4, pose=arch(0.2), gap=2e-3, overhang=0.25)
+    contact = uem.Contact(b.high, b.low, cohesion=uem.Adhesion(0.01, 1.0), coupling="mortar")
+    problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
+    pair, config = contact.pair, problem.config
+    smooth, way = (size * np.sin(2.0 * config.X + np.arange(b.gdim)) for size in (1e-4, 1.0))
+
+    def forces(u):
+        problem.u.x.array[:] = u.ravel()
+        problem.system.place()
+        return config.add_at_owners(*pair.applied_forces())
+
+    forces(smooth)
+    nodes, stiffness, _ = pair.slip_terms()
+    parts = [(nodes, stiffness), *pair.curvature()]
+    K = contact_curvature(parts, config.vector())
+    du = K.createVecRight()
+    du.array[:] = way[: config.n_owned].ravel()
+    wanted, h = (K * du).array_r.reshape(-1, b.gdim), 1e-7
+    found = -(forces(smooth + h * way) - forces(smooth - h * way)) / (2 * h)
+    assert highest(COMM, np.abs(wanted)) > 0.0
+    assert highest(COMM, np.abs(found - wanted)) < 1e-5 * highest(COMM, np.abs(wanted))
