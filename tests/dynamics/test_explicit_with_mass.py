@@ -75,6 +75,25 @@ def test_a_bar_on_a_wall(how):
     assert max(abs(row.defect) for row in book.rows) < 0.5 * 0.5 * cell / LENGTH * book.rows[0].kinetic
 
 
+@pytest.mark.parametrize("dt", [None, 2e-3], ids=["longest", "given"])
+def test_rows_of_an_energy_book_that_leaves_steps_out(dt):
+    """A step of which a book has both ends has the work and the impulse of contact that a book of all steps has."""
+    problem, _, stored = bars(cells=10)
+    books = every, some = [uem.EnergyBook(problem, stored) for _ in range(2)]
+    before, struck = None, 0.0
+    for step in uem.time_steps(problem, dt, end=0.2):
+        for book in books[: 1 if step.number % 4 == 2 else 2]:
+            book.write(step)
+        if step.number % 4 == 2:
+            continue
+        if before == step.number - 1:
+            pushed, work = ([(b.impulses[-1] - b.impulses[-2])[0, 1], b.rows[-1].contact - b.rows[-2].contact] for b in books)
+            np.testing.assert_allclose(work, pushed, rtol=1e-9, atol=1e-9 * every.rows[0].kinetic)
+            struck += pushed[0]
+        before = step.number
+    assert struck > 0.2 * every.impulses[-1][0, 1] > 0.0
+
+
 def test_what_is_lost_is_of_the_mesh():
     """Twice as many cells lose half as much energy."""
     lost = []

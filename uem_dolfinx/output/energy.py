@@ -58,7 +58,7 @@ class EnergyBook(Closing, given.Sealed):
 
     Columns: the fields of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... on the
     contactor's body. Works are integrated by the trapezoidal rule. In explicit steps with massy contactors, contact acts on masses for
-    the whole step: a row after every step has the exact impulse, and ``contact`` has what plastic impacts of these masses take.
+    the whole step: rows at both ends of a step give its exact impulse, and ``contact`` the energy lost in plastic impacts of these masses.
 
     Args:
         problem: with ``dynamics``.
@@ -118,9 +118,8 @@ class EnergyBook(Closing, given.Sealed):
                 "%s ends at time %.6g and is gone on with at %.6g: the work in between is missing; write a row after every step",
                 path, begin["time"], self.dynamics.time,
             )  # fmt: skip
-        #: Whether contact strikes masses at the beginning of explicit steps, and the mean velocity of the last step ``(n,)``.
+        #: Whether contact strikes masses at the beginning of explicit steps.
         self._struck = is_explicit(self.dynamics) and self.dynamics.contactors == "massy"
-        self._rate = np.array(self.dynamics.mean_velocity.x.array[: problem.config.n_owned * problem.config.gdim])
         # the work of the first step uses the initial load, too
         problem.set_load(self.dynamics.time)
         self._read_forces()
@@ -136,6 +135,8 @@ class EnergyBook(Closing, given.Sealed):
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
         u = np.array(problem.config.displacement[: problem.config.n_owned].ravel())
         self._u, self._time, self._driven = u, self.dynamics.time, self.dynamics.driven
+        #: Number of steps up to this instant, and the mean velocity of the last one ``(n,)``.
+        self._steps, self._rate = problem.step_control.number, np.array(self.dynamics.mean_velocity.x.array[:n])
         contact = sum((c.force.x.array[:n] for c in self._contacts), np.zeros(n))
         problem.bodies.assemble()
         # the work of supports on mass, with jumps of velocity, is the change of its kinetic energy, see ``driven``
@@ -180,14 +181,14 @@ class EnergyBook(Closing, given.Sealed):
             The new row.
         """
         u, forces, resultants, time, driven = self._u, self._forces, self._resultants, self._time, self._driven
-        before = self._at_points
+        before, rate, steps = self._at_points, self._rate, self.problem.step_control.number - self._steps
         self._read_forces()
         # NumPy's sums do not depend on where arrays lie in memory, those of BLAS do
         works, impulse = 0.5 * ((forces + self._forces) * (self._u - u)).sum(axis=1), 0.5 * (resultants + self._resultants)
-        if self._struck and self._time - time <= 1.5 * (dt := self.dynamics.dt):
+        if self._struck and steps == 1:
             # the forces act between the mean velocities of two steps
-            rate, self._rate = self._rate, (self._u - u) / dt
-            works[2:], impulse = 0.5 * dt * (self._forces[2:] * (rate + self._rate)).sum(axis=1), self._resultants
+            works[2:] = 0.5 * self.dynamics.dt * (self._forces[2:] * (rate + self._rate)).sum(axis=1)
+            impulse = self._resultants
         works[1] += self._driven - driven + works[3]
         self._works += reduced(self.problem.comm, works[:3])
         pairs = zip(before, self._at_points)

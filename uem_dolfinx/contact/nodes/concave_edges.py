@@ -13,10 +13,11 @@ from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
 from uem_dolfinx.arrays import Array, Bools, Ints, replace
 from uem_dolfinx.contact.nodes.corners import find_corners
 from uem_dolfinx.contact.seam.base import OnTarget
-from uem_dolfinx.contact.seam.corners import Corners
+from uem_dolfinx.contact.seam.corners import ON_PLANE, Corners
 from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.geometry.candidates import EQUALLY_NEAR
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
-from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.parallel import reduced
 
 #: So many bends a contactor passes freely in a step before a concave one holds it: sliding far is no chatter.
@@ -28,6 +29,9 @@ SHARP = 0.5
 #: A contactor that has changed facets across bends this often in a step gets averaged normals for the rest of it.
 #: [heuristic; changes in a step; test_polygons.py::test_sliding_along_a_polygon]
 MOST_CHANGES = 8
+#: The facet across a side is the nearest one to a point in the plane of the own facet, past the side by this part of the facet.
+#: [bound; half a facet; test_conforming_rings.py::test_vertices_opposite_vertices]
+ACROSS = 1e-3
 
 
 class ConcaveEdges:
@@ -123,21 +127,27 @@ class ConcaveEdges:
         Returns:
             The new state, and whether a contactor on this rank has entered a corner or left it for good.
         """
+        nearest = cast("FacetProjection", nearest)
         number = nearest.facet
         known = (state.facet == number) | (state.held == number[:, None]).any(axis=1) | (state.facet < 0)
-        moved = ~known & state.active & ~left & (state.changes < MOST_CHANGES)
-        i = np.flatnonzero(moved)
+        free = state.active & ~left & (state.changes < MOST_CHANGES)
+        moved = ~known & free
+        i, tied = np.flatnonzero(moved), self._at_bends(nearest, known & free & ~state.in_corner)
         facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
         settled = ~moved & ~left & ~state.in_corner
         facet[settled] = number[settled]
+        taken = np.zeros(len(i), dtype=bool)
+        entered = False
+        some = reduced(self.config.comm, np.array([len(i), len(tied)]))
+        if some[1]:
+            tied, others = self._between(nearest, points, replace(state, facet=facet), tied)
+            held[tied], entered = others, len(tied) > 0
         # first together with all its present facets, then with the first of these only
         together = _moved_up(np.column_stack([state.held[i], number[i]]))[:, : held.shape[1]]
         full = (state.held[i] >= 0).all(axis=1)
         alone = np.full_like(together, -1)
         alone[:, 0] = number[i]
-        taken = np.zeros(len(i), dtype=bool)
-        entered = False
-        for others, allowed in ((together, ~full), (alone, (state.held[i] >= 0).any(axis=1) | full)):
+        for others, allowed in ((together, ~full), (alone, (state.held[i] >= 0).any(axis=1) | full)) if some[0] else ():
             ask = np.flatnonzero(allowed & ~taken)
             c = self._corners_of(state, points, i[ask], others[ask])
             if c is None:
@@ -154,6 +164,30 @@ class ConcaveEdges:
         past = ~known & state.active & (state.changes >= MOST_CHANGES) & (held >= 0).any(axis=1)
         facet[past], held[past] = number[past], -1
         return replace(state, facet=facet, held=held, changes=changes), entered or bool(past.any())
+
+    def _at_bends(self, nearest: FacetProjection, which: Bools) -> Ints:
+        """Contactors of ``which (n,)`` whose closest points are at a concave side or vertex of their facets ``(k,)``."""
+        i = np.flatnonzero(which)
+        i = i[(self.target.shape.side_distances(nearest.xi[i]) < ON_SIDE).any(axis=1) & ~nearest.beyond[i].any(axis=1)]
+        out = nearest.foot[i] - nearest.x[i].mean(axis=1)
+        return i[np.einsum("kg,kg->k", nearest.averaged[i], out) < -ON_PLANE * nearest.facet_size[i]]
+
+    def _between(self, nearest: FacetProjection, points: Array, state: PairState, which: Ints) -> tuple[Ints, Ints]:
+        """Contactors of ``which (k,)`` that are as deep in a further facet as in their own, with this facet in ``held`` (collective).
+
+        With one of the two normals, which would be arbitrary, the force would lean to one side.
+        """
+        none = np.full((len(which), self.config.gdim - 1), -1)
+        out = nearest.foot[which] - nearest.x[which].mean(axis=1)
+        none[:, 0] = beside = self.target.project(nearest.foot[which] + ACROSS * out, which).facet
+        ask = np.flatnonzero((beside >= 0) & (beside != state.facet[which]))
+        c = self._corners_of(state, points, which[ask], none[ask])
+        if c is None:
+            return which[:0], none[:0]
+        heights = np.einsum("kjg,kg->kj", c.normals[:, :2], points[c.which] - c.foot)
+        alike = np.abs(heights[:, 0] - heights[:, 1]) <= EQUALLY_NEAR * nearest.facet_size[c.which]
+        hold = ask[c.concave & alike & self._can_be_held(c)]
+        return which[hold], none[hold]
 
     def _corners_of(self, state: PairState, points: Array, which: Ints, others: Ints) -> Corners | None:
         """Corners between the facet of some contactors and other facets ``(k, gdim - 1)`` (collective)."""

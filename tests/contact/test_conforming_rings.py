@@ -1,0 +1,118 @@
+"""A plug larger than the hole around it, with vertices opposite vertices: Lame's pressure, loose or tight, in 2D and 3D.
+
+The test to read first is ``test_vertices_opposite_vertices``. Every contactor starts behind a concave vertex of the target, as deep in
+one facet as in the next: with either normal alone, forces would turn a plug that almost nothing holds.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import ufl
+from benchmarks.scenes import Body
+from dolfinx import fem
+from helpers import box, clamp, gathered_vector, scene, slow
+
+import uem_dolfinx as uem
+from uem_dolfinx import compat
+from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.search import MeshTarget
+
+COMM = MPI.COMM_WORLD
+INNER, OUTER, W = 0.5, 2.0, 0.01
+
+
+def ring(cell: str, low: float, high: float, n: int, m: int) -> Body:
+    """A ring about the last axis, or a slice of a tube, in n x m cells."""
+    more = [] if cell in ("triangle", "quadrilateral") else [0.5]
+    b = box(cell, [low, 0.0, *[0.0] * len(more)], [high, 2 * np.pi, *more], [n, m, *[1] * len(more)])
+    x = b.x.copy()
+    x[:, 0], x[:, 1] = b.x[:, 0] * np.cos(b.x[:, 1]), b.x[:, 0] * np.sin(b.x[:, 1])
+    _, first, inverse = np.unique(np.round(x, 9), axis=0, return_index=True, return_inverse=True)
+    return Body(x[first], inverse.ravel()[b.cells])
+
+
+def plug(cell="quadrilateral", m=24, degree=1, coupling="node_to_surface", springs=1e-6, general=False, law=uem.NeoHooke):
+    """A plug in a hole of radius 1, both of m facets, bedded on ``springs``; problem, contact and the surface of the plug."""
+    s = scene(COMM, cell, [ring(cell, 1.0, OUTER, m // 6, m), ring(cell, INNER, 1.0 + W, m // 12, m)])
+    g = s.mesh.geometry.dim
+    V = compat.function_space(s.mesh, degree, (g,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+
+    def at_radius(r):
+        return lambda x: np.abs(np.hypot(x[:, 0], x[:, 1]) - r) < 1e-6
+
+    contactor, hole = s.tag("plug", 1, at_radius(1.0 + W)), s.tag("hole", 0, at_radius(1.0))
+    how = {"coupling": coupling, "max_penetration": 0.2}
+    contact = uem.GeneralContact(**how) if general else uem.Contact(contactor, hole, **how)
+    bcs = []
+    if g == 3:
+        bcs = [c for z in (0.0, 0.5) for k in (0, 1) for c in clamp(V, s.tag("end", k, lambda x, z=z: x[:, 2] == z), 2)]
+    F = law(1.0, 0.3, **({"kind": "plane_strain"} if g == 2 else {})).residual(u, v) * ufl.dx + springs * ufl.dot(u, v) * ufl.dx
+    return uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact]), contact
+
+
+def lame() -> float:
+    """The pressure of an interference of W between two rings in plane strain, with a modulus of 1 and Poisson's ratio of 0.3."""
+    E, nu = 1 / (1 - 0.3**2), 0.3 / (1 - 0.3)
+    outer, inner = ((OUTER**2 + 1) / (OUTER**2 - 1) + nu) / E, ((1 + INNER**2) / (1 - INNER**2) - nu) / E
+    return W / (outer + inner)
+
+
+def pressures(contact: uem.Contact) -> np.ndarray:
+    """Of all nodes in contact on all ranks."""
+    found = gathered_vector(contact.pressure.vector if hasattr(contact.pressure, "vector") else contact.pressure.x.petsc_vec)
+    return found[found > 0.0]
+
+
+@pytest.mark.parametrize(
+    ("cell", "degree", "coupling", "springs", "general"),
+    [
+        ("quadrilateral", 1, "node_to_surface", 1e-6, False),
+        ("quadrilateral", 1, "node_to_surface", 1e-6, True),
+        ("hexahedron", 1, "node_to_surface", 1e-6, False),
+        *(slow("quadrilateral", 1, c, k, False) for c, k in (("node_to_surface", 1e-3), ("mortar", 1e-6))),
+        *(slow("triangle", d, c, 1e-6, False) for d, c in product((1, 2), ("node_to_surface", "mortar"))),
+        *(slow("quadrilateral", 2, c, 1e-6, False) for c in ("node_to_surface", "mortar")),
+        slow("hexahedron", 1, "mortar", 1e-6, False),
+    ],
+)
+def test_vertices_opposite_vertices(cell, degree, coupling, springs, general):
+    """Lame's pressure within the mesh's error, in a few iterations; at degree 1 it is the same at all nodes, and nothing turns."""
+    problem, contact = plug(cell, 24, degree, coupling, springs, general)
+    (step,) = uem.load_steps(problem, 1)
+    assert step.cuts == 0 and step.newton_iterations <= 5
+    p = pressures(contact)
+    assert len(p) == 24 * degree * (2 if cell == "hexahedron" else 1)
+    # triangles are stiffer, and at degree 2 nodal pressures scatter along curved facets
+    assert abs(p.mean() / lame() - 1) < 0.05
+    if degree == 1:
+        assert np.ptp(p) < 1e-9 * p.mean()
+
+
+def test_pressures_converge():
+    """On twice as many cells the error is a third of what it was, or less."""
+    errors = []
+    for m in (12, 24):
+        problem, contact = plug(m=m)
+        list(uem.load_steps(problem, 1))
+        errors.append(abs(pressures(contact).mean() / lame() - 1))
+    assert errors[1] < errors[0] / 3
+
+
+def test_past_the_end_of_a_tube():
+    """Points behind the rim of a hole are past its end by their way along the axis alone, wherever facets bend beside them."""
+    s = scene(COMM, "hexahedron", [ring("hexahedron", 1.0, OUTER, 1, 12)])
+    V = compat.function_space(s.mesh, 1, (3,))
+    hole = s.tag("hole", 0, lambda x: np.abs(np.hypot(x[:, 0], x[:, 1]) - 1.0) < 1e-6)
+    target = MeshTarget(TargetFacets(Configuration(fem.Function(V)), hole))
+    angle = np.repeat(np.arange(24) * np.pi / 12, 3) + np.tile([0.0, 1e-3, -0.05], 24)
+    for past in (0.0, 0.02):
+        points = np.column_stack([1.01 * np.cos(angle), 1.01 * np.sin(angle), np.full(len(angle), 0.5 + past)])
+        beyond = target.project(points).beyond
+        np.testing.assert_allclose(np.abs(beyond), np.tile([0.0, 0.0, past], (len(angle), 1)), atol=1e-12)
