@@ -114,6 +114,49 @@ def test_prongs_of_other_kinds(cell, degree, normals):
     assert farthest(U) == pytest.approx(farthest(W), rel=0.1)
 
 
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        *map(
+            slow,
+            [{"explicit": True}, {"cell": "hexahedron", "explicit": True}, {"soft": True}, {"explicit": True, "friction": 0.3}],
+        ),
+    ],
+    ids=str,
+)
+def test_prongs_in_flight(how):
+    """Prongs that are thrown at each other meet and do not pass; momentum stays to rounding, and nothing gives energy."""
+    cell = how.get("cell", "quadrilateral")
+    g = 2 if cell == "quadrilateral" else 3
+    s = scene(COMM, cell, [fork(cell)])
+    V = compat.function_space(s.mesh, 1, (g,))
+    u, v, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
+    X = V.tabulate_dof_coordinates()
+    velocity.x.array.reshape(-1, g)[:, 0] = 0.03
+    velocity.x.array.reshape(-1, g)[:, 1] = -0.075 * np.sign(X[:, 1]) * np.maximum(X[:, 0], 0.0)
+    law = uem.NeoHooke(1.0, 0.3, kind="plane_strain" if g == 2 else "3d")
+    normal = uem.SoftContact(50.0) if how.get("soft") else None
+    contact = uem.GeneralContact(self_contact=True, normal=normal, friction=how.get("friction", 0.0))
+    scheme = {"scheme": uem.CentralDifferences(), "contactors": "massy"} if how.get("explicit") else {}
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity, **scheme)
+    problem = uem.UnitedProblem(law.residual(u, v) * ufl.dx, u, contacts=[contact], rtol=1e-10, dynamics=dynamics)
+    book, config, closed = uem.EnergyBook(problem, law.energy(u) * ufl.dx), problem.config, 0
+    sides = [
+        np.flatnonzero((np.abs(config.X[: config.n_owned, 1] - y) < 1e-9) & (X[: config.n_owned, 0] > -1e-9))
+        for y in (-0.05, 0.05)
+    ]
+    for step in uem.time_steps(problem, None if scheme else 0.1, 1.3):
+        row = book.write(step)
+        low, high = ((config.X + config.displacement)[side, 1] for side in sides)
+        slit = -COMM.allreduce(-high.min(initial=np.inf), op=MPI.MAX) - COMM.allreduce(low.max(initial=-np.inf), op=MPI.MAX)
+        assert slit > -0.01
+        assert row.kinetic + row.stored <= (1.0 + 1e-3) * book.rows[0].kinetic
+        closed += COMM.allreduce(any(pair.united.any() for pair in problem.pairs), op=MPI.LOR)
+    momenta = np.array(book.momenta)
+    assert closed >= 3 and np.abs(momenta - momenta[0]).max() < 1e-12 * np.abs(momenta[0]).max()
+
+
 def test_order_of_the_input():
     """Any order of nodes and cells gives the same displacements, to rounding."""
     ends = [farthest(closed("triangle", shuffle=seed)[2]) for seed in (None, 1)]

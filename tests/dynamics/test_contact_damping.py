@@ -144,6 +144,38 @@ def test_a_general_contact():
     assert found[1] == pytest.approx(found[0], abs=1e-5)
 
 
+@pytest.mark.parametrize("how", [{}, slow({"coupling": "mortar"}), slow({"dim": 3}), slow({"zeta": 0.3})], ids=str)
+def test_bodies_that_meet_corner_on_corner(how):
+    """In general contact two stiff bodies of unit mass between rollers part as masses on a spring and a dashpot, in few iterations."""
+    (dim, zeta), k, gap = (how.get(name, usual) for name, usual in (("dim", 2), ("zeta", 0.0))), 40.0, 0.0123
+    cell = "quadrilateral" if dim == 2 else "hexahedron"
+    low, one = [0.0] * (dim - 1), [1.0] * (dim - 1)
+    lower = box(cell, [*low, -1.0 - gap], [*one, -gap], [*[2] * (dim - 1), 6])
+    s = scene(COMM, cell, [lower, box(cell, [*low, 0.0], [*one, 1.0], [*[3] * (dim - 1), 6])])
+    V = compat.function_space(s.mesh, 1, (dim,))
+    sides = [s.tag(f"side {c}", body, at(c, end)) for c in range(dim - 1) for end in (0.0, 1.0) for body in (0, 1)]
+    bcs = [bc for side in sides for bc in clamp(V, side, int(side.name[-1]))]
+    u, velocity = fem.Function(V), fem.Function(V)
+    velocity.x.array.reshape(-1, dim)[V.tabulate_dof_coordinates()[:, dim - 1] > -0.5 * gap, dim - 1] = -1.0
+    normal = uem.SoftContact(k, damping=2.0 * zeta * np.sqrt(k / 2))
+    contact = uem.GeneralContact(normal=normal, coupling=how.get("coupling", "node_to_surface"), max_penetration=0.5)
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity)
+    problem = uem.UnitedProblem(linear(u, 1e5, 0.0), u, bcs=bcs, contacts=[contact], dynamics=dynamics, rtol=1e-10)
+    book, length, forces = uem.EnergyBook(problem), np.pi / np.sqrt(2.0 * k), []
+    for step in uem.time_steps(problem, length / 30, 1.3 * length):
+        book.write(step)
+        forces.append(sum(abs(touch.force[-1]) for touch in contact.touching()))
+        assert step.newton_iterations <= 4 and step.cuts == 0
+    own = slice(problem.config.n_owned)
+    upper = problem.config.X[own, -1] > -0.5 * gap
+    ways = dynamics.mass.of_nodes[:, -1] * dynamics.velocity.x.array.reshape(-1, dim)[own, -1]
+    parted = COMM.allreduce(float(ways[upper].sum() - ways[~upper].sum()))
+    assert parted == pytest.approx(restitution(zeta) if zeta else 1.0, abs=2e-2 if zeta else 1e-3)
+    assert np.abs(np.diff(np.array(book.momenta)[:, dim - 1])).max() < 1e-10 and forces[-1] == 0.0
+    if not zeta:
+        assert max(forces) == pytest.approx(np.sqrt(k / 2), rel=0.01)
+
+
 def test_what_is_refused():
     refused(uem.InputError, "damping = -1", lambda: uem.SoftContact(1.0, damping=-1.0))
     assert repr(uem.SoftContact(1.0, damping=2.0)) == "SoftContact(Linear(k=1.0), damping=2.0)"

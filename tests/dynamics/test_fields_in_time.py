@@ -11,7 +11,7 @@ import pytest
 import ufl
 from block_scenes import blocks
 from dolfinx import fem
-from helpers import at, box, highest, scene
+from helpers import at, box, highest, refused, scene, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx.algebra.restriction import Restriction
@@ -68,6 +68,46 @@ def test_a_pressure_that_changes_nothing(pressure):
     assert np.abs(a - b).max() < 1e-11 * np.abs(a).max()
     there, own = beside.problem.config.displacement, alone.problem.config.displacement
     assert highest(COMM, np.abs(np.linalg.norm(there, axis=1).sum() - np.linalg.norm(own, axis=1).sum())) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "how", [{"coupling": "mortar"}, *(slow({"coupling": "node_to_surface", "general": g}) for g in (False, True))], ids=str
+)
+def test_heat_of_friction_in_time(how):
+    """A block that is thrown onto a rough floor has the work of friction in it, however steps are divided; another duration is refused."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 2.0], [3, 6])])
+    W = uem.function_space(s.mesh, [("Lagrange", 1, (2,)), ("Lagrange", 1)])
+    floor, V = uem.RigidPlane((0.0, -0.015), (0.0, 1.0)), uem.function_space(s.mesh, 1, (2,))
+
+    def slide(follows: bool) -> tuple[float, float, set[float]]:
+        w, old, dt, last = fem.Function(W), fem.Function(W), fem.Constant(s.mesh, 0.01), [0.0]
+        (u, T), (v, q) = ufl.split(w), ufl.TestFunctions(W)
+        F = E * ufl.inner(ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))) * ufl.dx
+        F += (3.0 * (T - ufl.split(old)[1]) / dt * q + ufl.inner(ufl.grad(T), ufl.grad(q))) * ufl.dx
+        heat = uem.Conductance(0.0, field=1, temperature=0.0, friction_share=1.0, dt=dt)
+        if how.get("general"):
+            contact = uem.GeneralContact(rigid=floor, friction=0.2, heat=heat)
+        else:
+            bottom = s.tag("bottom", 0, at(1, 0.0))
+            contact = uem.Contact(bottom, floor, friction=0.2, heat=heat, coupling=how["coupling"])
+
+        def load(t: float) -> None:
+            if follows and t > last[0]:
+                dt.value = t - last[0]
+
+        dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=(0.3, -SPEED), gravity=(0.0, -1.0))
+        problem = uem.UnitedProblem(F, w, displacement=0, contacts=[contact], dynamics=dynamics, load=load, rtol=1e-10)
+        book, lengths = uem.EnergyBook(problem), set()
+        for step in uem.time_steps(problem, 0.01, 0.06, event_tolerance=0.1):
+            last[0], row = step.time, book.write(step)
+            lengths.add(round(step.dt, 6))
+            old.x.array[:] = w.x.array
+        return uem.integrate(3.0 * T * ufl.dx), row.friction, lengths
+
+    inside, work, lengths = slide(True)
+    assert len(lengths) > 2 and work > 1e-3
+    assert inside == pytest.approx(work, rel=1e-8)
+    refused(uem.InputError, ("dt = 0.01", "load"), lambda: slide(False))
 
 
 def test_going_on_in_time(folder):

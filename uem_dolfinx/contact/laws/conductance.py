@@ -38,7 +38,8 @@ class Conductance(given.Sealed):
         field: number of the part of the mixed space that is the temperature, scalar Lagrange of the displacement's degree or less.
         temperature: of a rigid target, a number or a Constant; None for a meshed target, which has its own.
         friction_share: part of the frictional heat that enters the contactor; the rest enters the target. None ignores frictional heat.
-        dt: duration of a step, a number or the Constant in the residual, to convert frictional work of a step to power.
+        dt: duration of a step, a number or the Constant in the residual, to convert frictional work of a step to power. In time steps
+            another duration is refused; shortened steps have their own, see ``load``.
         of_field: number of the part whose values ``h`` gets as T and T_target; None is ``field``. An electric conductance may so
             depend on the temperature.
         joule: number of the part that is an electric potential. The power of its current through this contact becomes heat; the

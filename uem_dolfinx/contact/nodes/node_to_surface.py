@@ -69,8 +69,8 @@ class NodeToSurface(OnTarget):
         return ConcaveEdges(self)
 
     def follow_by(self, edges: Any) -> None:
-        """Track contactors by another object than ``ConcaveEdges``, with its methods."""
-        self._edges = edges
+        """Track contactors by another object than ``ConcaveEdges``, with its methods; ends hold all of them."""
+        self._edges, self.ends_hold = edges, True
 
     def set(self, **changed: Any) -> None:
         """See ``OnTarget`` (collective)."""
@@ -120,7 +120,9 @@ class NodeToSurface(OnTarget):
 
     def _continued_at_end(self, nearest: Projection, state: PairState) -> Projection:
         """Continue closest points of contactors held by an end to below these, so that force and reaction are collinear."""
-        i = np.flatnonzero(state.active & state.at_end & (nearest.beyond != 0).any(axis=1))
+        # those that press by their gap are never active
+        held = state.at_end & (state.active if self._edges is None else ~state.passed)
+        i = np.flatnonzero(held & (nearest.beyond != 0).any(axis=1))
         return self.target.continued(nearest, i, nearest.foot[i] + nearest.beyond[i]) if len(i) else nearest
 
     def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:

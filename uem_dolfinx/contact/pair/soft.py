@@ -95,6 +95,7 @@ class SoftInterface(Interface):
         #: Damping over the length of the step, gaps at its beginning, and gaps s from which on pressures vanish ``(n,)``, or None.
         self._damped: tuple[Array, Array, Array] | None = None
         if isinstance(self.discretisation, NodeToSurface):
+            # also at corners of bodies in general contact: those opposite do not press
             self.discretisation.follow_by(_Edges())
         n = len(self.nodes)
         self.trial = self.committed = replace(self.committed, law_gap=np.full(n, np.inf))

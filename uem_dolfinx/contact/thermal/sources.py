@@ -12,6 +12,11 @@ from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.laws.constants import value
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
 from uem_dolfinx.contact.seam.dyads import Terms
+from uem_dolfinx.errors import InputError
+
+#: Durations of a step that differ by less are one.
+#: [bound; length of the step; -]
+SAME_DURATION = 1e-6
 
 
 class Source(Protocol):
@@ -83,7 +88,13 @@ class FrictionalHeat:
         work = pair.friction.step(pair.trial, pair.committed, pair.kinematics)[-1]
         # contactors that stick in a mean slip by the rounding of positions
         slips = np.abs(work) > GAP_ROUNDING * pair.config.size * np.linalg.norm(state.tau, axis=1)
-        return np.where(slips, work, 0.0) / value(self._law.dt)
+        dt, length = value(self._law.dt), 0.0 if (duration := pair.friction.limits.duration) is None else duration()
+        if length and abs(dt - length) > SAME_DURATION * length:
+            raise InputError(
+                f"heat: dt = {dt:.6g}, and the step in time takes {length:.6g}, so that the work of friction would be another heat: set a "
+                "Constant dt in the function load of the problem, which is called before every attempt, to the time since the last step"
+            )
+        return np.where(slips, work, 0.0) / dt
 
     def sizes(self) -> Array:
         """Slips are differences of positions."""
