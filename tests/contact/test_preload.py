@@ -245,3 +245,32 @@ def test_what_is_refused():
     bolt, _ = problem()
     raised(uem.InputTypeError, "force = None", lambda: bolt.tighten(None))
     raised(uem.InputError, "has no 'force' to be set", lambda: setattr(bolt, "force", 2.0))
+
+
+@pytest.mark.parametrize(
+    ("cell", "coupling", "h"),
+    [("triangle", "mortar", np.inf), slow("triangle", "node_to_surface", 6.0), slow("hexahedron", "node_to_surface", np.inf)],
+)
+def test_a_section_conducts(cell, coupling, h):
+    """A bolt between walls, tightened, locked and heated at one end: heat flows as through one piece, or a joint, and relieves it."""
+    b = blocks(COMM, cell, 2, 3 if coupling == "mortar" else 4)
+    g, E, ALPHA, K = b.gdim, 1000.0, 1e-5, 3.0
+    W = uem.function_space(b.scene.mesh, [("Lagrange", 1, (g,)), 1])
+    w, hot, (v, q) = fem.Function(W), fem.Constant(b.scene.mesh, 0.0), ufl.TestFunctions(W)
+    u, T = ufl.split(w)
+    law = uem.LinearElastic(E, 0.0, kind="plane_stress" if g == 2 else "3d")
+    F = (law.residual(u, v) - law.thermal_residual(u, v, ALPHA * T) + K * ufl.inner(ufl.grad(T), ufl.grad(q))) * ufl.dx
+    sides = [(c, b.scene.tag("side", body, at(c, end))) for c in range(g - 1) for end in (0.0, 1.0) for body in (0, 1)]
+    bcs = [uem.dirichlet(W.sub(0), tag, c) for c, tag in (*sides, (g - 1, b.bottom), (g - 1, b.top))]
+    bcs += [uem.dirichlet(W.sub(1), b.bottom, value=hot), uem.dirichlet(W.sub(1), b.top)]
+    bolt = uem.Preload(b.high, b.low, np.eye(g)[-1], force=5.0, coupling=coupling, heat=uem.Conductance(h, field=1))
+    problem = uem.UnitedProblem(F, w, displacement=0, bcs=bcs, contacts=[bolt], rtol=1e-11)
+    problem.solve()
+    assert bolt.carried == pytest.approx(5.0, rel=1e-9)
+    bolt.lock()
+    hot.value = 100.0
+    problem.solve()
+    # h = infinity: as one piece of length 2
+    flux = 100.0 / (2.0 / K + 1.0 / h)
+    assert abs(bolt.heat_power) == pytest.approx(flux, rel=1e-8)
+    assert bolt.carried == pytest.approx(5.0 - E * ALPHA * 50.0, rel=1e-8)

@@ -164,6 +164,16 @@ HEAT = "*CONDUCTIVITY\n2.0\n*DENSITY\n1.0\n*SPECIFIC HEAT\n{}\n"
 ENDS = "*BOUNDARY\nfoot 1, 11, 11, 100.\nhead 2, 11, 11, 300.\n*END STEP\n"
 
 
+def test_heat_at_a_section_of_a_bolt(folder):
+    """Temperatures of both sides of the cut do not meet, and the deck says so."""
+    text = columns([(0.0, 1.0, 2)]) + STEEL + HEAT.format(1.0) + "*SOLID SECTION, ELSET=body 1, MATERIAL=STEEL\n"
+    text += "*SURFACE, NAME=middle\n10, S2\n*PRE-TENSION SECTION, SURFACE=middle, NODE=999\n0., 0., 1.\n"
+    text += "*BOUNDARY\nfoot 1, 1, 3\nhead 1, 1, 3\n*STEP\n*COUPLED TEMPERATURE-DISPLACEMENT, STEADY STATE\n"
+    deck = ran(folder, text + "*BOUNDARY\n999, 1, 1, 1e-3\n" + ENDS.replace("head 2", "head 1"))
+    assert deck.temperature(111) == pytest.approx(100.0, rel=1e-8) or deck.temperature(111) == pytest.approx(300.0, rel=1e-8)
+    assert deck.left_out == ["heat through the section 'middle': none passes its cut"]
+
+
 KINDS = ["*HEAT TRANSFER, STEADY STATE\n", "*HEAT TRANSFER\n0.01, 50.\n", "*COUPLED TEMPERATURE-DISPLACEMENT\n0.01, 50.\n"]
 
 

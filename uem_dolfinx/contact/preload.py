@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from mpi4py import MPI
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.placement import Discretisation
@@ -44,6 +45,7 @@ class Preload(Contact):
         shortening: instead of a force, by how much the bolt is shortened, a length, as by turning its nut; a number or such a function.
         coupling: see ``Contact``.
         measure: see ``Contact``.
+        heat: see ``Contact``; ``uem.Conductance(np.inf, field=1)`` for a bolt in one piece that was cut, which conducts nothing without.
         name: see ``Contact``.
 
     Raises:
@@ -60,6 +62,7 @@ class Preload(Contact):
         shortening: float | Callable[[float], float] | None = None,
         coupling: Literal["node_to_surface", "mortar"] | Callable[..., Discretisation] = "node_to_surface",
         measure: Literal["reference", "current"] = "reference",
+        heat: Conductance | Sequence[Conductance] | None = None,
         name: str | None = None,
     ):
         with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
@@ -76,7 +79,7 @@ class Preload(Contact):
                 raise InputError(f"force = {given.shown(force)}, shortening = {given.shown(shortening)}: expected one of them")
             self._force = None if force is None else _given("force", force)
             self._shortening = None if shortening is None else _given("shortening", shortening)
-        super().__init__(contactor, target, coupling=coupling, tied=True, measure=measure, name=name)
+        super().__init__(contactor, target, coupling=coupling, tied=True, measure=measure, heat=heat, name=name)
 
     def __repr__(self) -> str:
         """Name, axis, force and coupling."""

@@ -281,6 +281,7 @@ class Deck(given.Sealed):
         self._drive(now, [(step.forces if pulled else step.held).get(reference, 0.0) / t for step in self.steps])
         led: dict[str, Any] = {"force" if pulled else "shortening": lambda s: float(now[0])}
         direction = axis[:g] if any(axis[:g]) else None
+        self.left_out += [f"heat through the section '{name}': none passes its cut"] if self._model.thermal else []
         return Preload(self._tag(name), self._tag(BACK.format(name)), direction, coupling="mortar", name=name, **led)
 
     def _interaction(self, pair: Pair) -> Interaction:
