@@ -47,8 +47,8 @@ def product(A: Blocks, B: Blocks) -> Blocks:
 
     g = A.value.shape[1]
     inner, of_inner = np.unique(B.row, return_inverse=True)
-    at = np.minimum(np.searchsorted(inner, A.column), max(len(inner) - 1, 0))
-    kept = inner[at] == A.column if len(inner) else np.zeros(len(A.row), dtype=bool)
+    at = inner.searchsorted(A.column)
+    kept = np.append(inner, -1)[at] == A.column
     rows, of_row = np.unique(A.row[kept], return_inverse=True)
     columns, of_column = np.unique(B.column, return_inverse=True)
     if not len(rows):
@@ -66,9 +66,10 @@ def product(A: Blocks, B: Blocks) -> Blocks:
 
 def in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array, Ints, Ints]:
     """Blocks in the order of their rows, their columns, and the start of each row."""
-    order = np.argsort(row, kind="stable")
-    ends = np.bincount(row, minlength=n_rows).cumsum()
-    return value[order], column[order], np.concatenate([[0], ends])
+    order = row.argsort(kind="stable")
+    starts = np.zeros(n_rows + 1, dtype=np.int64)
+    np.bincount(row, minlength=n_rows).cumsum(out=starts[1:])
+    return value[order], column[order], starts
 
 
 def summed(A: Blocks) -> Blocks:
@@ -77,7 +78,8 @@ def summed(A: Blocks) -> Blocks:
     row, column = A.row[order], A.column[order]
     new = np.ones(len(row), dtype=bool)
     new[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
-    return Blocks(row[new], column[new], sums_of_groups(A.value, np.flatnonzero(new), order) if len(row) else A.value)
+    first = new.nonzero()[0]
+    return Blocks(row[first], column[first], sums_of_groups(A.value, first, order) if len(row) else A.value)
 
 
 def to_owners(space: Nodes, A: Blocks) -> Blocks:
@@ -89,9 +91,10 @@ def to_owners(space: Nodes, A: Blocks) -> Blocks:
 
 def places_of(A: Blocks, rows: Ints) -> tuple[Ints, Ints]:
     """Places of the blocks in ``rows (m,)``, possibly repeated, row after row, and their number in each ``(m,)``."""
-    order = np.argsort(A.row, kind="stable")
-    low, high = (np.searchsorted(A.row[order], rows, side=side) for side in ("left", "right"))
-    counts = high - low
+    order = A.row.argsort(kind="stable")
+    known = A.row[order]
+    low = known.searchsorted(rows)
+    counts = known.searchsorted(rows, "right") - low
     return order[np.repeat(low - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())], counts
 
 

@@ -96,11 +96,14 @@ class UnitingEquations:
 
     def by_node(self) -> Iterator[tuple[Indices, Ints]]:
         """Nodes ``(n,)`` with k active equations each, and these equations ``(n, k)``, for every k."""
-        which = np.flatnonzero(self.active)
-        order = which[np.argsort(self.node[which], kind="stable")]
-        nodes, first, counts = np.unique(self.node[order], return_index=True, return_counts=True)
-        for k in np.unique(counts):
-            yield nodes[counts == k], order[first[counts == k][:, None] + np.arange(k)]
+        which = self.active.nonzero()[0]
+        order = which[self.node[which].argsort(kind="stable")]
+        at = self.node[order]
+        first = np.concatenate([[True], at[1:] != at[:-1]])[: len(at)].nonzero()[0]
+        counts = np.concatenate([first[1:], [len(at)]])[: len(first)] - first
+        for k in range(1, counts.max(initial=0) + 1):
+            if len(some := first[counts == k]):
+                yield at[some], order[some[:, None] + np.arange(k)]
 
 
 def least_left(A: Array) -> Array:

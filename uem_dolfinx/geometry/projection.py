@@ -213,7 +213,7 @@ class FacetProjection:
         """Which ``points (n, gdim)`` are inside the target, and below no point of their facet, but behind a shallow concave edge of it."""
         beside = np.linalg.norm(points - self.foot - self.height[:, None] * self.normal, axis=1)
         behind = (beside > ALONG_NORMAL * self.facet_size) & (beside < SHALLOW * -self.height)
-        return np.flatnonzero(behind & ~self.beyond.any(axis=1))
+        return (behind & ~self.beyond.any(axis=1)).nonzero()[0]
 
     def take(self, which: Ints) -> FacetProjection:
         """Some of its rows ``(k,)``."""
@@ -227,7 +227,7 @@ class FacetProjection:
         on a straight 2D facet this is the formula of the method's description.
         """
         H = gap_hessians(*self._at(which))
-        if len(i := np.flatnonzero(self._from_edge[which])):
+        if len(i := self._from_edge[which].nonzero()[0]):
             H[i] = _hessians_at_edges(*self._at(np.asarray(which)[i])[:-1])
         return H
 
@@ -279,7 +279,7 @@ def _hessians_at_edges(n: Array, g: Array, w: Array, dN: Array, ddN: Array, x: A
     relative = np.concatenate([np.ones((k, 1)), -w], axis=1)
     across = np.eye(gdim) - n[:, :, None] * n[:, None]
     H = np.einsum("ka,kb,kgh->kagbh", relative, relative, across / g[:, None, None]).reshape(k, size, size)
-    i = np.flatnonzero(w.max(axis=1) < 1.0 - AT_VERTEX)
+    i = (w.max(axis=1) < 1.0 - AT_VERTEX).nonzero()[0]
     if gdim == 2 or not len(i):
         return H
     n, g, w, dN, ddN, x, relative = (v[i] for v in (n, g, w, dN, ddN, x, relative))

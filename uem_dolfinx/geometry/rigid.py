@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -139,8 +140,14 @@ class RigidSurface(given.Sealed):
     averaged = faceted = False
     #: Whether gaps are distances everywhere, not only on the surface.
     measures = False
+    #: Whether functions are the user's, which may raise or return other shapes than asked for.
+    of_user = True
     dofs: Indices = np.zeros((0, 0), np.int32)
     keys: Ints = np.zeros(0, np.int64)
+
+    def __init_subclass__(cls, **how: Any) -> None:
+        super().__init_subclass__(**how)
+        cls.of_user = cls.__module__ != __name__
 
     def __init__(
         self,
@@ -157,9 +164,9 @@ class RigidSurface(given.Sealed):
             optional = f is None and what == "hessian"
             given.kind(f"{name}: {what}", f, optional or given.function(f), "a function of places (3, n)")
         # functions of points (n, gdim) from here on
-        points = OfPoints(distance)
-        self.distance, self.gradient = points.of(distance), points.of(gradient)
-        self.hessian = None if hessian is None else points.of(hessian)
+        of_points = OfPoints(distance).of if self.of_user else lambda f: f
+        self.distance, self.gradient = of_points(distance), of_points(gradient)
+        self.hessian = None if hessian is None else of_points(hessian)
         self.motion: Motion | None = None
         self._reference = None if reference is None else given.vector(f"{name}: reference", reference)
         #: Dimension of the arguments, None if only the functions determine it.
@@ -288,6 +295,8 @@ class RigidSurface(given.Sealed):
         """Values of a function at ``points (n, gdim)``, which must have this shape; it is not called without points."""
         if not len(points):
             return np.zeros(shape)
+        if not self.of_user:
+            return f(points)
         values = ask(f"{self.name}: {what}", lambda x: np.asarray(f(x), dtype=float), points)
         if values.shape != shape:
             raise InputError(

@@ -58,4 +58,4 @@ def shared_target(target: Target, comm: MPI.Comm, gdim: int) -> Target:
         remedy = f"give it points and directions of {gdim} numbers"
         raise SurfaceError(f"{name} is given in {own}D, but the displacement in {gdim}D: {remedy}")
     given.alike(comm, name, stride=target.stride, place=getattr(target, "_reference", None))
-    return cast(Target, SharedTarget(target, comm))
+    return cast(Target, SharedTarget(target, comm)) if getattr(target, "of_user", True) else target

@@ -84,13 +84,13 @@ class Limits:
         """Limits at normal forces ``lam (n,)``, of which some contactors slip, and derivatives by ``lam`` and the slip."""
         lam = np.maximum(lam, 0.0) if self._held is None else self._held
         limit, slope = self._stuck(lam)
-        rate = np.zeros_like(limit)
+        rate = none = np.zeros(len(limit))
         if slides_otherwise(self.law):
             sliding = self.law.sliding(self.value, lam, self.area, self.speed)
             limit, slope, rate = (np.where(slips, new, old) for new, old in zip(sliding, (limit, slope, rate)))
             dt = 0.0 if self.duration is None else self.duration()
-            rate = rate / dt if dt > 0.0 else np.zeros_like(rate)
-        return limit, slope if self._held is None else np.zeros_like(slope), rate
+            rate = rate / dt if dt > 0.0 else none
+        return limit, slope if self._held is None else none, rate
 
     def cone(self, lam: Array, slips: Bools) -> tuple[Array, Array]:
         """Limits as linear functions of the normal force, about ``lam (n,)``: values at 0 and slopes ``(n,)``."""

@@ -52,20 +52,22 @@ def with_friction(
     # rows of sticking contactors are the same in P and Q if they have the current weights
     apart = not pointwise and (own.moved is not None or slips or not keeps_ties)
 
-    def along(node: Ints, t: Array, gap: Array, active: Bools, ties: Ties) -> UnitingEquations:
-        there, k = place[ties.row] >= 0, np.arange(len(node) // max(m, 1))[:, None]
-        row, weight = (place[ties.row[there]] + m * k).ravel(), np.tile(ties.weight[there], len(k))
-        return UnitingEquations(node, t, gap, active, row, np.tile(ties.followed[there], len(k)), weight[:, None] * t[row])
+    def along(node: Ints, t: Array, gap: Array, active: Bools, ties: Ties, k: int = 1) -> UnitingEquations:
+        there = place[ties.row] >= 0
+        row = (place[ties.row[there]] + m * np.arange(k)[:, None]).ravel()
+        followed, weight = (np.concatenate([of_term[there]] * k) for of_term in (ties.followed, ties.weight))
+        return UnitingEquations(node, t, gap, active, row, followed, weight[:, None] * t[row])
 
     # all rows along the first tangents, then along the second ones
     node: Any = own.rows.node[:m]
     k = g - 1
     t = np.concatenate([T[:, r] for r in range(k)])
-    resisted = np.tile(of_friction, k) & t.any(axis=1)
-    how = np.tile(node, k), t, away.ravel(), resisted & np.tile(stick, k)
-    numbers = np.tile(contactor, k), np.full(k * m, NORMAL), np.repeat(np.arange(k), m)
-    moved = along(*how, frame.way) if apart else None
-    tangential = ContactRows(along(*how, frame.ties), *numbers, moved, None, resisted)
+    nodes, contactors, rubs, sticks = (np.concatenate([of_all] * k) for of_all in (node, contactor, of_friction, stick))
+    resisted = rubs & t.any(axis=1)
+    how = nodes, t, away.ravel(), resisted & sticks
+    numbers = contactors, np.full(k * m, NORMAL), np.repeat(np.arange(k), m)
+    moved = along(*how, frame.way, k) if apart else None
+    tangential = ContactRows(along(*how, frame.ties, k), *numbers, moved, None, resisted)
     tilt = crosswise = None
     if slips:
         rest = without_terms(own.rows.select(np.arange(len(own)) >= m))

@@ -318,12 +318,12 @@ class Sliding:
         """Normal and tangential forces from the multipliers of equations ``(m,)``; see ``Interface.forces`` (collective)."""
 
         def friction(lam: Array) -> Array:
-            limit, i = self._limit(state, lam) / kinematics.ties.share, np.flatnonzero(equations.tangent >= 0)
+            limit, i = self._limit(state, lam) / kinematics.ties.share, (equations.tangent >= 0).nonzero()[0]
             tau = np.where(self.slipping(state)[:, None], -limit[:, None] * self.directions(state), 0.0)
             np.add.at(tau, equations.contactor[i], multipliers[i, None] * equations.rows.direction[i])
             if du is not None and self._follows_slip:
                 sideways, part, stiffness = self.turning(state, kinematics)
-                i = np.flatnonzero(self.slipping(state))
+                i = self.slipping(state).nonzero()[0]
                 taken = np.einsum("kgh,kh->kg", stiffness, self.frame.way.relative(du)[i])
                 tau[i] -= taken + part[:, None] * np.einsum("kgh,kh->kg", sideways, self.pivot.tau[i])
             return tau
@@ -352,7 +352,7 @@ class Sliding:
             Projectors across the slip directions ``(k, g, g)``, the removed part of the force across them ``(k,)``, and stiffnesses
             across and, with rate laws, along them ``(k, g, g)``.
         """
-        i = np.flatnonzero(self.slipping(state))
+        i = self.slipping(state).nonzero()[0]
         T, s = self.frame.tangents[i], self.directions(state)[i]
         forwards = s[:, :, None] * s[:, None, :]
         sideways = np.einsum("krg,krh->kgh", T, T) - forwards
@@ -368,7 +368,7 @@ class Sliding:
         """Terms of slip in tangent and residual: change of direction, and rate dependence."""
         if not self._follows_slip:
             return None
-        i = np.flatnonzero(self.slipping(state))
+        i = self.slipping(state).nonzero()[0]
         sideways, part, stiffness = self.turning(state, kinematics)
         nodes, share, moved = self.frame.ties.tables(self.frame.way, i)
         (k, m), g = share.shape, self.config.gdim
@@ -383,7 +383,7 @@ class Sliding:
         """
         slips = self.slipping(state) & (state.lam > 0)
         held = self.active(state) & _of(state).stick & (not self.discretisation.traits.at_feet)
-        which = np.flatnonzero(slips | held)
+        which = (slips | held).nonzero()[0]
         if not reduced(self.config.comm, len(which)):
             return None
         force = np.where(slips[:, None], -self._limit(state, state.lam)[:, None] * self.directions(state), _of(state).tau)

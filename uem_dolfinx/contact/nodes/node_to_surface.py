@@ -130,7 +130,7 @@ class NodeToSurface(OnTarget):
         f = state.friction
         if f is None or not isinstance(self.target, MeshTarget) or not isinstance(nearest, FacetProjection):
             return nearest
-        i = np.flatnonzero(f.stick & state.active & ~state.in_corner & (f.facet >= 0))
+        i = (f.stick & state.active & ~state.in_corner & (f.facet >= 0)).nonzero()[0]
         if not reduced(self.config.comm, len(i)):
             return nearest
         own = self.raised(self.target.at(points[i], f.facet[i], f.xi[i]), i)
@@ -242,7 +242,7 @@ class NodalKinematics(PlacedOnTarget):
             return found
         gaps, more, contactors, kinds = c.gaps(self.points[c.which]), [], [found.contactor], [found.kind]
         for r in range(1, of.config.gdim):
-            j = np.flatnonzero(r < c.count)
+            j = (r < c.count).nonzero()[0]
             w, none = c.which[j], np.zeros(len(j), bool)
             more.append(UnitingEquations.along(of.nodes[w], c.axes[j, r], c.nodes[j], c.weights[j], gaps[j, r], none))
             contactors.append(w)
@@ -269,7 +269,7 @@ class NodalKinematics(PlacedOnTarget):
         (lam, nodal), c = self._nodal(state, lam), self.corners
         force = nodal[:, None] * self.projection.normal
         for r in range(1, self.of.config.gdim):
-            j = np.flatnonzero(rows.kind == r)
+            j = (rows.kind == r).nonzero()[0]
             force[rows.contactor[j]] += multipliers[j, None] * rows.rows.direction[j]
         lam = lam * self.cone
         if c is not None:
@@ -287,7 +287,7 @@ class NodalKinematics(PlacedOnTarget):
 
     def nodal_forces(self, state: PairState) -> tuple[Ints, Array]:
         """The force on each contactor, and the opposite force on the target's nodes with the weights of the closest point."""
-        p, i, config = self.projection, np.flatnonzero((state.force != 0).any(axis=1)), self.of.config
+        p, i, config = self.projection, (state.force != 0).any(axis=1).nonzero()[0], self.of.config
         nodes = np.concatenate([config.to_global(self.of.nodes[i])[:, None], p.nodes[i]], axis=1)
         share = np.concatenate([np.ones((len(i), 1)), -p.weights[i]], axis=1)
         return nodes.ravel(), (share[..., None] * state.force[i, None, :]).reshape(-1, config.gdim)
@@ -295,7 +295,7 @@ class NodalKinematics(PlacedOnTarget):
     def curvature(self, state: PairState, along: Along | None = None) -> list[tuple[Ints, Array]]:
         """Derivatives of the rows of contactors with force; contactors in corners remain on the edge, and their friction does not turn."""
         p, c, nodes = self.projection, self.corners, self.of.nodes
-        i = np.flatnonzero(((state.lam > 0) | ~state.active) & (state.nodal != 0) & ~state.in_corner)
+        i = (((state.lam > 0) | ~state.active) & (state.nodal != 0) & ~state.in_corner).nonzero()[0]
         own, followed, blocks = nodes[i], p.nodes[i], -state.nodal[i, None, None] * p.hessians(i)
         if c is not None:
             own = np.concatenate([own, nodes[c.which]])

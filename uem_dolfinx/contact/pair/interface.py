@@ -211,7 +211,7 @@ class Interface:
     @property
     def approach(self) -> tuple[Ints, UnitingEquations]:
         """Inactive contactors in front of the target, and their normal equations; negative numbers where no activation is needed."""
-        ahead = np.flatnonzero(~self.trial.active & ~self.off & self.kinematics.movable)
+        ahead = (~self.trial.active & ~self.off & self.kinematics.movable).nonzero()[0]
         rows = self.kinematics.gap_rows.select(ahead, np.ones(len(self.nodes), bool))
         return ahead, rows.rows.select(rows.normal)
 
@@ -227,7 +227,7 @@ class Interface:
         if lacks:
             near = self.kinematics.ends.near(self.trial, self.max_penetration)
             self.trial = replace(self.trial, reserved=near & ~self.tied if known else active)
-        own = self.kinematics.gap_rows.select(np.flatnonzero(self.trial.reserved), active)
+        own = self.kinematics.gap_rows.select(self.trial.reserved.nonzero()[0], active)
         if self.friction is not None:
             own = self.friction.equations(own, self.trial, self.kinematics)
         return own if self.tie is None else self.tie.join(own)

@@ -312,24 +312,25 @@ def _meet(rigid: Sequence[Interface]) -> None:
     if not rigid:
         return
     node, held = (np.concatenate(parts) for parts in zip(*((pair.nodes, pair.trial.active) for pair in rigid)))
-    normal = np.concatenate([pair.kinematics.projection.normal for pair in rigid])
-    i = np.flatnonzero(held)
-    i = i[np.argsort(node[i], kind="stable")]
+    i = held.nonzero()[0]
+    i = i[node[i].argsort(kind="stable")]
     # contactors with several rows, each row among those of its node
-    there, group, counts = np.unique(node[i], return_inverse=True, return_counts=True)
-    place = np.arange(len(i)) - np.searchsorted(node[i], node[i])
-    k = int(counts.max(initial=1))
-    every = np.zeros((len(there) + 1, k if k > 1 else 0, normal.shape[1]))
+    place = np.arange(len(i)) - node[i].searchsorted(node[i])
+    k = int(place.max(initial=0)) + 1
+    others = np.zeros((len(node), k if k > 1 else 0, rigid[0].config.gdim))
     if k > 1:
+        normal = np.concatenate([pair.kinematics.projection.normal for pair in rigid])
+        there, group = np.unique(node[i], return_inverse=True)
+        every = np.zeros((len(there) + 1, *others.shape[1:]))
         every[group, place] = normal[i]
-    at = np.searchsorted(there, node)
-    known = np.append(there, -1)[at] == node
-    others = every[np.where(known, at, len(there))]
-    if k > 1:
+        at = there.searchsorted(node)
+        others[:] = every[np.where(np.append(there, -1)[at] == node, at, len(there))]
         others[i, place] = 0.0
-    for pair, own in zip(rigid, np.split(others, np.cumsum([len(pair.nodes) for pair in rigid])[:-1])):
+    first = 0
+    for pair in rigid:
         if pair.friction is not None:
-            pair.friction.meet(pair.kinematics, own)
+            pair.friction.meet(pair.kinematics, others[first : first + len(pair.nodes)])
+        first += len(pair.nodes)
 
 
 def _surfaces(pairs: Sequence[Interface]) -> tuple[list[Indices], Ints]:
