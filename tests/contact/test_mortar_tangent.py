@@ -12,7 +12,7 @@ from helpers import CELLS
 from mortar_scenes import Blocks, disturbed
 
 import uem_dolfinx as uem
-from uem_dolfinx.contact.mortar.ends import curvature
+from uem_dolfinx.contact.mortar.ends import curvature, own_curvature
 
 
 class WeightedGap:
@@ -128,6 +128,23 @@ def test_curvature_against_differences(cell, target, offset):
             index = (nodes[:, :, None] * phi.g + np.arange(phi.g)).reshape(len(nodes), -1)
             np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
         assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
+
+
+@pytest.mark.parametrize("cell,target,offset", SCENES)
+def test_own_rows(cell, target, offset):
+    """All nodes' own rows at once are rows of the curvature by one multiplier after the other."""
+    phi = weighted_gap(cell, target, offset)
+    points, g = phi.leave_out(target).points, phi.g
+    way = np.random.default_rng(4).standard_normal(phi.start.reshape(-1, g).shape)
+    together, apart = np.zeros((2, *way.shape))
+    for some, nodes, rows in own_curvature(points, phi.pressure):
+        own = nodes[:, : points.nodes.shape[1]][:, some]
+        np.add.at(together, own, np.einsum("pjgch,pch->pjg", rows, way[nodes]))
+    for j, one in enumerate(np.eye(points.nodes.shape[1])):
+        for nodes, blocks in curvature(points, phi.pressure * one):
+            moved = np.einsum("pik,pk->pi", blocks, way[nodes].reshape(len(nodes), -1))
+            np.add.at(apart, nodes[:, j], moved.reshape(*nodes.shape, g)[:, j])
+    assert np.abs(together - apart).max() < 1e-12 * np.abs(apart).max()
 
 
 @pytest.mark.parametrize("target,offset", product(("mesh", "ball", "end"), (0.0, varying)))

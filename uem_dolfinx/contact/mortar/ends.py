@@ -14,6 +14,7 @@ The position of the target's boundary on the contactor facet, the gap there, c a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,18 +40,45 @@ def curvature(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
     Returns:
         Lists of global nodes ``(p, c)`` and symmetric blocks ``(p, c gdim, c gdim)``.
     """
-    pressing, parts = np.flatnonzero(pressure.any(axis=1)), []
+    return [at.curvature(alone) for alone in _some_at_once(at, pressure)] + _at_ends(at, pressure)
+
+
+def own_curvature(at: SegmentPoints, pressure: Array) -> Iterator[tuple[slice, Ints, Array]]:
+    """Each node's own rows in ``curvature`` by its own multiplier alone; arguments as there.
+
+    Yields:
+        Places of nodes in their facets, global nodes ``(p, c)``, and rows of these nodes ``(p, n, gdim, c, gdim)``.
+    """
+    (_, nc), g = pressure.shape, at.x.shape[2]
+    if not at.unequal:
+        for alone in _some_at_once(at, pressure):
+            nodes, rows = at.curvature(alone, own=True)
+            yield slice(nc), nodes, rows.reshape(len(nodes), nc, g, nodes.shape[1], g)
+    for j, one in enumerate(np.eye(nc)):
+        for nodes, blocks in (curvature if at.unequal else _at_ends)(at, pressure * one):
+            p, width = nodes.shape
+            yield slice(j, j + 1), nodes, blocks[:, j * g : (j + 1) * g].reshape(p, 1, g, width, g)
+
+
+def _some_at_once(at: SegmentPoints, pressure: Array) -> Iterator[Array]:
+    """The pressure of some facets after the other, zero on all others ``(m, nc)``."""
+    pressing = np.flatnonzero(pressure.any(axis=1))
     last = np.cumsum(np.bincount(at.facet, minlength=len(pressure))[pressing])
     for some in np.split(pressing, np.flatnonzero(np.diff(last // AT_ONCE)) + 1):
         alone = np.zeros_like(pressure)
         alone[some] = pressure[some]
-        parts.append(at.curvature(alone))
-    if at.other is not None:
-        which = at.partly_covered()
-        which = which[(pressure[at.facet[which]] != 0).any(axis=1)]
-        if len(which):
-            parts += [(nodes, -blocks) for nodes, blocks in _Ends(at, at.other, pressure, which).second_derivatives()]
-    return parts
+        yield alone
+
+
+def _at_ends(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
+    """What ``curvature`` has from the target's ends."""
+    if at.other is None:
+        return []
+    which = at.partly_covered()
+    which = which[(pressure[at.facet[which]] != 0).any(axis=1)]
+    if not len(which):
+        return []
+    return [(nodes, -blocks) for nodes, blocks in _Ends(at, at.other, pressure, which).second_derivatives()]
 
 
 @dataclass(frozen=True)

@@ -250,18 +250,23 @@ def dual_tangents(tangent: Array, n: Array) -> Array:
 
 
 def sum_of_products(pair: Ints, weight: Array, left: Array, right: Array, k: int) -> Array:
-    """Sums of ``weight left' right`` over the points of each of ``k`` pairs.
+    """Sums of ``weight left' right`` over the points of each of ``k`` pairs ``(k, nn gdim, nn gdim)``.
 
     Args:
         pair: of the points, ascending ``(q,)``.
-        weight: ``(q,)``.
+        weight: ``(q,)``; or one for each of the first nodes ``(q, nc)``, for their rows in the sums plus their transposes, each of its own
+            weight ``(k, nc gdim, nn gdim)``.
         left: linear functions of the nodes ``(q, nn, gdim)``.
         right: likewise.
         k: number of pairs.
     """
-    size = left.shape[1] * left.shape[2]
-    left, right = (left * weight[:, None, None]).reshape(-1, size), right.reshape(-1, size)
-    out, count = np.zeros((k, size, size)), np.bincount(pair, minlength=k)
+    if weight.ndim == 2:
+        both, one = ((left, right), (right, left)), np.ones(len(pair))
+        parts = [sum_of_products(pair, one, weight[:, :, None] * a[:, : weight.shape[1]], b, k) for a, b in both]
+        return parts[0] + parts[1]
+    rows, size = left.shape[1] * left.shape[2], right.shape[1] * right.shape[2]
+    left, right = (left * weight[:, None, None]).reshape(-1, rows), right.reshape(-1, size)
+    out, count = np.zeros((k, rows, size)), np.bincount(pair, minlength=k)
     first = np.cumsum(count) - count
     for c in np.unique(count[count > 0]):
         which = np.flatnonzero(count == c)

@@ -206,20 +206,23 @@ class SegmentPoints:
 
     # -- second derivatives ----------------------------------------------------------------------------------------------
 
-    def curvature(self, pressure: Array) -> tuple[Ints, Array]:
+    def curvature(self, pressure: Array, own: bool = False) -> tuple[Ints, Array]:
         """Minus the second derivatives of the weighted gaps times their multipliers.
 
         Args:
             pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
+            own: whether only each node's own rows in the derivatives of its own gap are made; not for ``unequal`` parts.
 
         Returns:
-            Global nodes of the pairs with pressure ``(p, nc + nt)``, and symmetric blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``.
+            Global nodes of the pairs with pressure ``(p, nc + nt)``, and symmetric blocks ``(p, (nc + nt) gdim, (nc + nt) gdim)``, or
+            their ``own`` rows ``(p, nc gdim, (nc + nt) gdim)``.
         """
         nc, nt, g = self.nodes.shape[1], self.opposite.shape[1], self.to_gap.shape[1]
         some = np.bincount(self.segments.pair, minlength=len(self.facet)) > 0
         pressing = np.flatnonzero((pressure[self.facet] != 0).any(axis=1) & some)
         e, k = self.facet[pressing], len(pressing)
-        amount = np.einsum("mj,mjb->mb", pressure[e], self.duals.A[e])
+        amount = pressure[e][:, :, None] * self.duals.A[e]
+        amount = amount if own else amount.sum(axis=1)
         pair, force, gap, offset, t, eta, motions = self._loaded(pressing, amount)
         n, size = self.planes.normal[e], self.planes.size[e]
         turned = t + 2 * n[pair] if nt else n[pair]
@@ -229,7 +232,7 @@ class SegmentPoints:
             for slide, change in self._slides(motions, self.other, tab, self.y[pressing][pair], n[pair], t):
                 half += sum_of_products(pair, force, slide, change, k)
             sides = self.sides(self.other, pressing).between()
-            step = np.einsum("qb,qb->q", sides.b, amount[sides.pair]) * sides.weight * sides.slope
+            step = np.einsum("qb,q...b,q->q...", sides.b, amount[sides.pair], sides.weight * sides.slope)
             half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
         elif self.shape_operator is not None:
             # pairs correspond to facets, with points in their order
@@ -239,15 +242,18 @@ class SegmentPoints:
         if self.unequal:
             gaps = motions.along(t) + motions.of_area((((2 if nt else 1) * gap - offset) / size[pair])[:, None] * n[pair])
             half += self._stretched(pressing, pair, pressure, gaps)
-        blocks = half + half.transpose(0, 2, 1)
+        blocks = half if own else half + half.transpose(0, 2, 1)
         # what is not closed, with the second order of the facet's size and direction: once for each facet
         _, first, of_facet = np.unique(e, return_index=True, return_inverse=True)
-        open_force = np.column_stack([force * gap, (force * gap)[:, None] * turned])
-        opened = self._opened(e[first], add_up(of_facet[pair], open_force, len(first)), self.other is not None)
+
+        def of_all(arm: Array) -> Array:
+            open_force = products(force if own else force[:, None], arm)
+            return add_up(of_facet[pair], open_force, len(first)).reshape(len(first), nc if own else 1, 1 + g)
+
+        opened = self._opened(e[first], of_all(np.column_stack([gap, gap[:, None] * turned])), self.other is not None)
         if self.offsets is not None:
-            less = np.column_stack([force * offset, (force * offset)[:, None] * n[pair]])
-            opened -= self._opened(e[first], add_up(of_facet[pair], less, len(first)), False)
-        blocks.reshape(k, nc + nt, g, nc + nt, g)[first, :nc, :, :nc] += opened
+            opened -= self._opened(e[first], of_all(np.column_stack([offset, offset[:, None] * n[pair]])), False)
+        blocks.reshape(k, nc if own else nc + nt, g, nc + nt, g)[first, :nc, :, :nc] += opened
         nodes = np.concatenate([self.nodes[e], self.opposite[pressing]], axis=1)
         return nodes, -blocks
 
@@ -270,15 +276,16 @@ class SegmentPoints:
         """Points of pairs that press with ``amount (p, nc)`` in the basis: their pairs, forces, gaps, offsets, t, eta and motions.
 
         Where all facets are affine and grow evenly, t is the same all over a pair: one point stands for all, with sums for values.
+        With an amount of each node's own ``(p, nc, nc)``, forces are ``(q, nc)``, and all points are kept.
         """
         k, s, e = len(pressing), self.segments, self.facet[pressing]
         place = np.full(len(self.facet), -1, dtype=np.int64)
         place[pressing] = np.arange(k)
         q = np.flatnonzero(place[s.pair] >= 0)
         pair = place[s.pair[q]]
-        force = np.einsum("qb,qb->q", self.b[q], amount[pair]) * s.weight[q]
+        force = np.einsum("qb,q...b,q->q...", self.b[q], amount[pair], s.weight[q])
         phi, N, gap, size, turning = self.phi[q], self.N[q], s.gap[q], self.planes.size[e], self.turning[e]
-        if self.other is None or self.unequal or not (self.shape.affine and self.other.affine):
+        if self.other is None or self.unequal or amount.ndim == 3 or not (self.shape.affine and self.other.affine):
             return pair, force, gap, self.offset[q], self.to_gap[q], s.eta[q], Motions(phi, N, gap / size[pair], turning[pair])
         total = add_up(pair, force[:, None] * np.column_stack([phi, N, gap, self.offset[q]]), k)
         one = q[np.searchsorted(pair, np.arange(k))]
@@ -291,7 +298,8 @@ class SegmentPoints:
 
         Args:
             e: facets.
-            open_force: forces times gaps, and these times ``t + 2 n``, or n unless they are ``high`` ``(p, 1 + gdim)``.
+            open_force: forces times gaps, and these times ``t + 2 n``, or n unless they are ``high``, for all rows or for each node's
+                ``(p, 1 or nc, 1 + gdim)``.
             high: whether gaps are heights over a mesh, which grow with the area vectors.
         """
         turn, n, size = self.turning[e], self.planes.normal[e], self.planes.size[e]
@@ -301,12 +309,12 @@ class SegmentPoints:
         else:
             grown = (n[:, None, None] @ turn)[:, :, 0]
             square -= grown[:, :, :, None, None] * grown[:, None, None]
-        out = (open_force[:, 0] / size**2)[:, None, None, None, None] * square
+        out = (open_force[:, :, 0] / size[:, None] ** 2)[:, :, None, None, None] * square
         if turn.shape[2] == 3:
             ring = ring_of(self.shape)
             c = len(ring)
-            vector = self.sign[e, None] * open_force[:, 1:] / size[:, None]
-            out[:, :c, :, :c] -= 0.5 * ring[None, :, None, :, None] * skew(vector)[:, None, :, None, :]
+            vector = (self.sign[e] / size)[:, None, None] * open_force[:, :c, 1:]
+            out[:, :c, :, :c] -= 0.5 * ring[None, :, None, :, None] * skew(vector)[:, :, :, None, :]
         return np.asarray(out)
 
     def _slides(

@@ -14,7 +14,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar.duals import add_up, basis_of, products
-from uem_dolfinx.contact.mortar.ends import curvature
+from uem_dolfinx.contact.mortar.ends import own_curvature
 from uem_dolfinx.contact.mortar.rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
 from uem_dolfinx.contact.mortar.segment_motions import Motions, dual_tangents, sum_of_products
 from uem_dolfinx.contact.mortar.tangent import SegmentPoints
@@ -174,15 +174,11 @@ def turning(
         parts.append(terms_of(at.nodes[e], over, np.concatenate([np.zeros((*grown.shape[:3], g * g + g)), grown], axis=3)))
     length = np.linalg.norm(rows.parts, axis=2, keepdims=True)
     outward = rows.parts / np.where(length > 0, length, 1.0)
-    for j in range(nc):
-        alone = np.zeros((m, nc))
-        alone[:, j] = there[:, j, 0]
-        for nodes, blocks in curvature(at, alone):
-            p, width = nodes.shape
-            own = -blocks[:, j * g : (j + 1) * g].reshape(p, g, width, g).swapaxes(1, 2)
-            longer = np.einsum("pg,pwgh->pwh", outward[_places(at.nodes, nodes[:, :nc]), j], own)
-            columns = [own.reshape(p, width, g * g), longer, np.zeros((p, width, g))]
-            parts.append(terms_of(nodes[:, j : j + 1], nodes, np.concatenate(columns, axis=2)[:, None]))
+    for some, nodes, blocks in own_curvature(at, there[:, :, 0]):
+        own, (p, width) = -blocks.swapaxes(2, 3), nodes.shape
+        longer = np.einsum("pjg,pjwgh->pjwh", outward[_places(at.nodes, nodes[:, :nc])][:, some], own)
+        columns = [own.reshape(p, -1, width, g * g), longer, np.zeros((*longer.shape[:3], g))]
+        parts.append(terms_of(nodes[:, :nc][:, some], nodes, np.concatenate(columns, axis=3)))
     row, term, value = elimination.at_owners(parts, np.ones(n))
     values = np.zeros((len(row) + len(weights[0]) + len(which), 1 + g * g + 2 * g))
     values[: len(row), 1:] = value
