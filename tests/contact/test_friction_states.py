@@ -19,7 +19,7 @@ def state(stick, direction):
 
 
 def nothing(n):
-    return Violations(np.zeros(n, bool), np.zeros(n, bool), np.zeros(n))
+    return Violations(np.zeros(n, bool), np.zeros(n, bool))
 
 
 def test_tangents_in_free_components():
@@ -49,14 +49,10 @@ def test_stick_and_slip():
     contact = nothing(5)
     contact.release[4] = True
     seen = stick_slip.Seen(np.ones(5), tau, np.full(5, 0.3), slip, np.zeros(5))
-    wrong = stick_slip.find_violations(
-        contact, s, np.ones(5, bool), seen, np.full(5, 2.0), force_rounding=1e-9, gap_rounding=1e-9
-    )
+    wrong = stick_slip.find_violations(contact, s, np.ones(5, bool), seen, force_rounding=1e-9, gap_rounding=1e-9)
     assert wrong.slide.tolist() == [False, True, False, False, False]
     assert wrong.hold.tolist() == [False, False, False, True, False]
     assert wrong.count == 3
-    assert wrong.violation == pytest.approx([0.0, 0.1, 0.0, 0.2, 0.0])
-    assert wrong.among_the_worst(0.2).hold.sum() == 1 and wrong.among_the_worst(0.2).slide.sum() == 0
     after = stick_slip.exchange(s, wrong, tau)
     assert after.stick.tolist() == [True, False, False, True, True]
     assert after.direction.tolist() == [[0, 0], [1, 0], [1, 0], [0, 0], [0, 0]]
@@ -75,9 +71,7 @@ def test_springs_that_are_dragged(way, bound, stick, back):
         slipped = np.where(s.stick, 0.0, way - bound * s.direction[:, 0])
         tau = -(way - slipped)[:, None] * [[1.0, 0.0]]
         seen = stick_slip.Seen(np.ones(8), tau, bound, slipped[:, None] * [[1.0, 0.0]], np.zeros(8))
-        wrong = stick_slip.find_violations(
-            nothing(8), s, np.ones(8, bool), seen, np.ones(8), force_rounding=1e-12, gap_rounding=1e-12
-        )
+        wrong = stick_slip.find_violations(nothing(8), s, np.ones(8, bool), seen, force_rounding=1e-12, gap_rounding=1e-12)
         if not wrong.count:
             break
         s = stick_slip.exchange(s, wrong, tau)

@@ -159,7 +159,7 @@ def test_time_steps_with_friction_begin_on_arrays(monkeypatch):
 def test_when_arrays_are_used():
     """Once in a problem, instead of the first factorisation for another state, or after ten solves without."""
     scene = driven(mu=0.3, law=st_venant, n=(3, 5))
-    wrong = [Violations(np.zeros(n := len(pair.nodes), bool), np.ones(n, bool), np.ones(n)) for pair in scene.problem.pairs]
+    wrong = [Violations(np.zeros(n := len(pair.nodes), bool), np.ones(n, bool)) for pair in scene.problem.pairs]
     new = [replace(one, enter=one.release, release=one.enter) for one in wrong]
     none = [Violations.none(len(pair.nodes)) for pair in scene.problem.pairs]
     taken = []

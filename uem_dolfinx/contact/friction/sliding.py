@@ -195,7 +195,6 @@ class Sliding:
         violated: Violations,
         state: PairState,
         seen: Traction,
-        stiffness: Array,
         rounding: tuple[Array, float],
         du: Array | None,
     ) -> stick_slip.FrictionViolations:
@@ -205,7 +204,6 @@ class Sliding:
             violated: violations of the contact conditions.
             state: of the interface.
             seen: contact forces, current or predicted.
-            stiffness: of the contactors ``(n,)``.
             rounding: forces ``(n,)`` and a length; smaller values count as zero.
             du: increment of the owned nodes used for the prediction ``(n_owned, gdim)``; None for the current configuration.
         """
@@ -217,7 +215,7 @@ class Sliding:
         turned = replace(_of(state), direction=self.directions(state))
         forces, lengths = rounding
         active = self.active(state)
-        return stick_slip.find_violations(violated, turned, active, by, stiffness, force_rounding=forces, gap_rounding=lengths)
+        return stick_slip.find_violations(violated, turned, active, by, force_rounding=forces, gap_rounding=lengths)
 
     @property
     def _lost(self) -> Bools:

@@ -136,7 +136,6 @@ def find_violations(
     state: FrictionState,
     frictional: Bools,
     seen: Seen,
-    stiffness: Array,
     *,
     force_rounding: Array | float,
     gap_rounding: float,
@@ -148,7 +147,6 @@ def find_violations(
         state: of the contactors.
         frictional: active contactors with friction ``(n,)``.
         seen: forces and slips.
-        stiffness: of the contactors, a force per length ``(n,)``.
         force_rounding: smaller forces count as zero, for all or for each contactor ``(n,)``.
         gap_rounding: smaller lengths count as zero.
     """
@@ -158,9 +156,7 @@ def find_violations(
     slide = staying & state.stick & ((excess > force_rounding) | driven)
     forward = np.einsum("ng,ng->n", seen.slip, state.direction)
     hold = staying & ~state.stick & ((forward < -gap_rounding) | ~state.direction.any(axis=1))
-    excess = np.where(driven, seen.forced * stiffness, excess)
-    violation = np.where(slide, excess, np.where(hold, -forward * stiffness, violated.violation))
-    return FrictionViolations(violated.enter, violated.release, violation, slide, hold, driven, seen)
+    return FrictionViolations(violated.enter, violated.release, slide, hold, driven, seen)
 
 
 def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> FrictionState:

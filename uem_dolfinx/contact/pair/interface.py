@@ -156,7 +156,6 @@ class Interface:
         self,
         gap: Array,
         seen: Traction,
-        stiffness: Array,
         force_rounding: Array,
         gap_rounding: float,
         swept: bool,
@@ -167,7 +166,6 @@ class Interface:
         Args:
             gap: deciding gaps ``(n,)``.
             seen: contact forces, current or predicted.
-            stiffness: of the contactors along the normal ``(n,)``.
             force_rounding: smaller forces count as zero ``(n,)``.
             gap_rounding: smaller gaps count as zero, as do gaps below the rounding of positions.
             swept: skip contactors that have slid off a thin target, since it may sweep past them during the iteration.
@@ -187,13 +185,12 @@ class Interface:
             pulled,
             off,
             self.kinematics.movable & ~apart,
-            stiffness,
             force_rounding=force_rounding,
             gap_rounding=rounding,
         )
         if self.friction is None:
             return violated
-        return self.friction.violated(violated, self.trial, seen, stiffness, (force_rounding, rounding), du)
+        return self.friction.violated(violated, self.trial, seen, (force_rounding, rounding), du)
 
     def exchange(self, violated: active_set.Violations) -> None:
         """Change the status of violated contactors (collective)."""

@@ -2,8 +2,8 @@
 
 The conditions are ``gap >= 0, force >= 0``, one of them zero [UEM, 4.4]. They are solved on the linearised problem, before any node
 moves: its solution predicts gaps and forces, violated contactors are exchanged, and it is solved again (block pivoting; Judice and
-Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Violations.count`` and ``Violations.worst``
-over them between ``find_violations`` and ``exchange``.
+Pires, 1994, doi:10.1016/0305-0548(94)90106-6). A caller with several ranks reduces ``Violations.count`` over them between
+``find_violations`` and ``exchange``.
 """
 
 from __future__ import annotations
@@ -32,12 +32,8 @@ GIVING_WAY = 0.25
 #: Half of what touches at first in the plane: a quarter would be right for whole bodies, a half for those cut at a plane of symmetry.
 #: [convention; width of the overlap; test_active_set.py::test_first_touch_of_a_paraboloid]
 HALF_WIDTH = 1 / 3
-#: Contactors as wrong as the worst, but for this part, are exchanged with it: rounding does not choose between equals.
-#: [convention; the worst violation; test_active_set.py::test_equals_are_exchanged_together]
-TIED = 1e-6
-#: So many exchanges in a row may bring no fewer wrong contactors, and no state again, before the worst is exchanged alone, and as many
-#: of the worst before the first.
-#: [convention; exchanges; test_active_set.py::test_when_the_worst_goes_alone]
+#: So many exchanges in a row may bring no fewer wrong contactors, and no state again, before the first is exchanged alone.
+#: [convention; exchanges; test_active_set.py::test_when_the_first_goes_alone]
 PATIENCE = 30
 
 
@@ -48,28 +44,21 @@ class Violations:
     Attributes:
         enter: open contactors with negative gap.
         release: closed contactors in tension, or whose gap can no longer be closed.
-        violation: as a force: the tension, or the penetration times the contactor's stiffness; zero if not violated.
     """
 
     enter: Bools
     release: Bools
-    violation: Array
 
     @classmethod
     def none(cls, n: int) -> Violations:
         """No violation at n contactors."""
         right = np.zeros(n, dtype=bool)
-        return cls(right, right, np.zeros(n))
+        return cls(right, right)
 
     @property
     def count(self) -> int:
         """Number of violated contactors."""
         return int(self.enter.sum() + self.release.sum())
-
-    @property
-    def worst(self) -> float:
-        """Largest violation, a force."""
-        return float(self.violation.max(initial=0.0))
 
     @property
     def which(self) -> Bools:
@@ -78,11 +67,7 @@ class Violations:
 
     def among(self, kept: Bools) -> Violations:
         """The violations of ``kept (n,)`` contactors."""
-        return Violations(self.enter & kept, self.release & kept, np.where(kept, self.violation, 0.0))
-
-    def among_the_worst(self, worst: float) -> Violations:
-        """The violations equal to the ``worst`` of all."""
-        return self.among(self.violation >= (1.0 - TIED) * worst)
+        return Violations(self.enter & kept, self.release & kept)
 
     def of_contact(self) -> Violations:
         """The violations of the contact conditions."""
@@ -90,7 +75,7 @@ class Violations:
 
     def on_first_touch(self, gap: Array, depth: float) -> Violations:
         """Entering contactors of at least this ``depth``, a length, and all released ones; ``gap (n,)`` are deciding gaps."""
-        return Violations(self.enter & (gap <= -depth), self.release, self.violation)
+        return Violations(self.enter & (gap <= -depth), self.release)
 
 
 def deep_enough(span: float, gdim: int) -> float:
@@ -115,7 +100,6 @@ def find_violations(
     lam: Array,
     off: Bools,
     movable: Bools,
-    stiffness: Array,
     *,
     force_rounding: Array | float,
     gap_rounding: float,
@@ -128,14 +112,12 @@ def find_violations(
         lam: normal contact force, current or predicted ``(n,)``.
         off: contactors past the target's end, or excluded for another reason ``(n,)``.
         movable: contactors whose gap can be closed ``(n,)``.
-        stiffness: of the contactors along the normal, a force per length ``(n,)``.
         force_rounding: smaller forces count as zero, for all or for each contactor ``(n,)``.
         gap_rounding: smaller gaps count as zero.
     """
     release = state.active & ((lam < -force_rounding) | ~movable)
     enter = ~state.active & ~off & movable & (gap < -gap_rounding)
-    violation = np.where(enter, -gap * stiffness, np.where(release, np.where(movable, -lam, np.inf), 0.0))
-    return Violations(enter, release, violation)
+    return Violations(enter, release)
 
 
 def exchange(state: PairState, violated: Violations) -> PairState:
@@ -149,13 +131,11 @@ class Rule:
 
     #: All of them: fast, but it may cycle.
     ALL = 0
-    #: Only the worst, with equal ones: rarely cycles.
-    WORST = 1
     #: Only the first in a fixed order: never cycles if the matrix between gaps and forces is a P-matrix (Murty, 1974,
     #: doi:10.1007/BF01580244).
-    FIRST = 2
+    FIRST = 1
     #: No exchange: even the last rule has cycled.
-    NONE = 3
+    NONE = 2
 
 
 class Pivoting:

@@ -18,7 +18,6 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import label_of
-from uem_dolfinx.contact.seam.active_set import TIED
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
@@ -36,6 +35,9 @@ ON_FACET = 1e-2
 #: A warning is given if the missing force of corners exceeds this part of the contact force: resultants are wrong by one per cent or more.
 #: [convention; largest contact force so far; test_target_corners.py::test_what_a_warning_of_corners_contains]
 LACKING = 0.1
+#: Corners whose depths differ by less than this part are equally deep, as solutions are no more accurate.
+#: [bound; depth of a corner; -]
+EQUALLY_DEEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ class TargetCorners:
             found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in which]
             everywhere = sorted((one for there in comm.allgather(found) for one in there), reverse=True)
             # of equally deep corners, take the first by position, independent of rounding and partition
-            deepest = min(place for part, place, _ in everywhere if part >= (1.0 - TIED) * everywhere[0][0])
+            deepest = min(place for part, place, _ in everywhere if part >= (1.0 - EQUALLY_DEEP) * everywhere[0][0])
             size, place, deep = next(one for one in everywhere if one[1] == deepest)
             missing = lacking[k] / self.largest[k] if self.largest[k] > 0.0 else np.inf
             harmful[int(k)] = CornerInside(place, deep, size, missing, self._at_own_corners(int(k)))

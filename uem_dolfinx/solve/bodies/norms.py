@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -12,13 +10,6 @@ from uem_dolfinx.arrays import Array
 
 #: A norm of forces; in mixed problems one for each field, with the displacement's first ``(n_fields,)``.
 Norm: TypeAlias = float | Array
-#: A residual that has grown in so many iterations, one after the other, does not come back: what touches or is nearly turned inside out
-#: may make as large a one at once, which falls from then on.
-#: [heuristic; iterations; test_newton_loop.py::test_a_step_that_runs_away_is_given_up]
-RUNNING_AWAY = 5
-#: It has run away where it is so many times the forces at work.
-#: [heuristic; norm of the forces; test_newton_loop.py::test_a_step_that_runs_away_is_given_up]
-FAR_AWAY = 1e3
 
 
 def first(norm: Norm) -> float:
@@ -36,9 +27,3 @@ def worst(norm: Norm, rounding: Norm, real: Norm) -> tuple[float, float, float]:
     every = [np.atleast_1d(a) for a in np.broadcast_arrays(norm, rounding, real)]
     k = int(np.argmax(every[0] / np.where(every[2] > 0.0, every[2], np.inf)))
     return float(every[0][k]), float(every[1][k]), float(every[2][k])
-
-
-def runs_away(residuals: Sequence[float]) -> bool:
-    """Whether relative residuals of successive iterations diverge."""
-    last = residuals[-RUNNING_AWAY - 1 :]
-    return len(last) > RUNNING_AWAY and last[-1] > FAR_AWAY and all(a < b for a, b in pairwise(last))

@@ -54,7 +54,7 @@ def touch_ahead(
     violated = []
     for pair, gap in zip(pairs, gaps):
         none = np.zeros(len(pair.nodes))
-        violated.append(pair.violated(gap, pair.traction._replace(lam=none), none, none, near, False, du))
+        violated.append(pair.violated(gap, pair.traction._replace(lam=none), none, near, False, du))
     if reduced(comm, any(w.enter.any() for w in violated), op=MPI.LOR):
         for pair, first in zip(pairs, deepest_of(pairs, gaps, violated)):
             pair.exchange(first)

@@ -105,7 +105,7 @@ class _Slots:
         pair, i, pivot = self.pair, self.contactor, None
         before, friction, now = pair.trial.active, pair.friction, pair.trial.active.copy()
         now[i] = active
-        state = active_set.exchange(pair.trial, Violations(now & ~before, before & ~now, np.zeros(len(now))))
+        state = active_set.exchange(pair.trial, Violations(now & ~before, before & ~now))
         if friction is not None:
             state = friction.come_and_go(state, before)
             assert state.friction is not None

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 #: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
 #: [convention; a direction; test_exchanges.py::test_the_order_does_not_depend_on_ranks]
 ALONG = np.sqrt([2.0, 3.0, 5.0])
-#: The active set of a linearised problem settles within so many exchanges of many contactors or of the worst, or the step is cut.
+#: The active set of a linearised problem settles within so many exchanges of many contactors, or the step is cut.
 #: [bound; exchanges; -]
 MOST_EXCHANGES = 100
 #: Exchanges of the first contactor alone find the active set of every convex problem without friction; they may take so many of them.
@@ -215,9 +215,6 @@ class Exchanges:
         if rule >= Rule.FIRST and (curved or self.softens) and not self.straight:
             # with curvature or softening the problem may have no solution or several; without it has exactly one
             self._pivoting, self.straight, self.convex = Pivoting(), True, True
-        elif rule == Rule.WORST:
-            worst = reduced(comm, max(w.worst for w in violated), op=MPI.MAX)
-            chosen = [w.among_the_worst(worst) for w in violated]
         elif rule == Rule.FIRST:
             chosen = self._first(violated)
         elif rule == Rule.NONE:

@@ -20,7 +20,7 @@ from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFinite
 from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.bodies.field_scales import driving
-from uem_dolfinx.solve.bodies.norms import Norm, first, ratio, runs_away, worst
+from uem_dolfinx.solve.bodies.norms import Norm, first, ratio, worst
 from uem_dolfinx.solve.rigid.unheld import no_precision, unheld
 
 #: A residual that keeps this part of its norm twice has met its rounding.
@@ -296,7 +296,7 @@ def solve_united(
         converged = steady and state.closed and bool(np.all(norm <= small))
         hidden = steady and np.all(norm <= np.maximum(small, rounding)) and np.any((stalled >= 2) & (small < norm))
         flown = np.atleast_1d((stalled >= 2) & (np.maximum(small, bounded(rounding, forces)) < norm) & (norm <= rounding))
-        if converged or hidden or flown.any() or (lost := runs_away([i.residual for i in history])) or k == max_iterations:
+        if converged or hidden or flown.any() or k == max_iterations:
             history.append(Iteration(ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
             if converged:
@@ -319,10 +319,10 @@ def solve_united(
         history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
         _report(history, verbose)
         length = _advance(bodies, method, problem, step, line_search)
-    last, more = history[-1], "" if lost else ", or raise max_iterations"
+    last = history[-1]
     raise ConvergenceError(
         f"no convergence in {k} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
-        f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps{more}",
+        f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps, or raise max_iterations",
         history,
     )
 

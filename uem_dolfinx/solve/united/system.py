@@ -192,9 +192,9 @@ class BodySystem:
                     at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             self._swept = not at_rest
             moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
-            here = [(pair, self._across(pair), bodies.rounding_at(pair.nodes)) for pair in pairs]
             found = [
-                pair.violated(pair.kinematics.gap, pair.traction, across, least, 0.0, self._swept) for pair, across, least in here
+                pair.violated(pair.kinematics.gap, pair.traction, bodies.rounding_at(pair.nodes), 0.0, self._swept)
+                for pair in pairs
             ]
             violated = count(pairs, found)
             # a released body falls, even if the active set still changes
@@ -290,7 +290,7 @@ class BodySystem:
             for k, pair in ((k, pair) for k, pair in enumerate(self.pairs) if pair.asked):
                 along = self._across(pair)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                violated[k] = pair.violated(gaps[k], forces[k], along, least, near, self._swept, moved)
+                violated[k] = pair.violated(gaps[k], forces[k], least, near, self._swept, moved)
             costly = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap)
             if costly and (solved := state.rows.settle(self.bodies, self.residual(), self.curvature, increment)):
                 return self._with_rows(state, solved)
