@@ -323,8 +323,7 @@ def _meet(rigid: Sequence[Interface]) -> None:
         there, group = np.unique(node[i], return_inverse=True)
         every = np.zeros((len(there) + 1, *others.shape[1:]))
         every[group, place] = normal[i]
-        at = there.searchsorted(node)
-        others[:] = every[np.where(np.append(there, -1)[at] == node, at, len(there))]
+        others[:] = every[np.where(np.append(there, -1)[at := there.searchsorted(node)] == node, at, len(there))]
         others[i, place] = 0.0
     first = 0
     for pair in rigid:
