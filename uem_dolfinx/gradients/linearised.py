@@ -46,6 +46,7 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.seam.placement import ContactRows
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
+from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.contact_fields import along_field
 from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
@@ -67,7 +68,7 @@ from uem_dolfinx.gradients.shape_slopes import ShapeSlopes
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.norms import ratio
-from uem_dolfinx.solve.bodies.tangent import curvature_of, is_skew, slip_terms, together
+from uem_dolfinx.solve.bodies.tangent import contact_curvature, curvature_of, is_skew, slip_terms, together
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.taken import in_rows, uniform, wanted_by_step
 from uem_dolfinx.solve.united.rows import BodyState, Rows
@@ -114,12 +115,14 @@ class Linearised:
         P: restriction matrix of the active contactors.
         rows: their equations; ``equations`` lists the equations of each of the problem's ``interfaces``.
         multipliers: of all equations of contacts, and of users ``(m,)``.
+        slopes: derivatives by the anchors of each interface, in a recorded step.
         ramp: shares of the Dirichlet values, see ``solve.taken``, in the rows of vectors ``(n_rows, gdim)``.
     """
 
     P: Restriction
     rows: Rows
     multipliers: Array
+    slopes: Sequence[AnchorSlopes | None] = ()
 
     def __init__(self, problem: UnitedProblem, derivatives: Derivatives | None = None, held: Array | float | None = None):
         self.problem, self.config = problem, problem.config
@@ -260,13 +263,13 @@ class Linearised:
 
     def stiffness_of(self, contact: Contact | None = None) -> PETSc.Mat | None:
         """Derivative of the forces of a contact, or of all, by the displacement, with the opposite sign (collective)."""
-        pairs, like = acting(self.problem, contact), self.config.unknowns.vector()
-        curvature = curvature_of([pair for pair, _ in pairs], like, True, False, states=[state for _, state in pairs])
-        return together(curvature, self.stiffness_of_gaps(pairs))
-
-    def stiffness_of_gaps(self, pairs: Sequence[tuple[Any, ...]]) -> PETSc.Mat | None:
-        """Stiffness of the gaps of soft contacts (collective)."""
-        return slip_terms([pair for pair, *_ in pairs if pair.trial.has_law], self.config.unknowns.vector())[0]
+        known, like = dict(zip(map(id, self.problem.interfaces), self.slopes)), self.config.unknowns.vector()
+        acts = [(pair, state, known.get(id(pair))) for pair, state in acting(self.problem, contact)]
+        pairs, states = [pair for pair, *_ in acts], [own.without_stuck(state) if own else state for _, state, own in acts]
+        curvature = curvature_of(pairs, like, any(self.slopes) or not self.slopes, False, states=states)
+        gaps, _ = slip_terms([pair for pair in pairs if pair.trial.has_law], like)
+        turned = [part for _, state, own in acts if own for part in own.turned(state)]
+        return together(together(curvature, gaps), contact_curvature(turned, like) if turned else None)
 
     @property
     def _turns_back(self) -> bool:
@@ -303,8 +306,7 @@ class Linearised:
         Returns:
             Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
         """
-        pair, config = m.contact.pair, self.config
-        gaps = np.zeros_like(self.multipliers)
+        pair, config, gaps = m.contact.pair, self.config, np.zeros_like(self.multipliers)
         if m.parameter == "friction":
             return gaps, rubbed(pair)
         own, which = self.equations_of(m.contact, f"its {m.parameter}")
@@ -343,8 +345,7 @@ class Linearised:
 
     def changes_of_users(self, m: fem.Constant, change: Array) -> tuple[Array, Array]:
         """As ``changes``, along a change of a Constant in equations, couplings or forces at nodes (collective)."""
-        opened, pushed = self.users.changes(m, change)
-        gaps = np.zeros_like(self.multipliers)
+        (opened, pushed), gaps = self.users.changes(m, change), np.zeros_like(self.multipliers)
         if len(opened):
             self._refuse_replaced("equations and couplings", "a value in them")
             gaps[len(gaps) - len(opened) :] = opened

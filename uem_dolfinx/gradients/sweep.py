@@ -25,7 +25,6 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
@@ -36,11 +35,11 @@ from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.derivatives import Derivatives, transposed
 from uem_dolfinx.gradients.gradient import AnyControl
 from uem_dolfinx.gradients.linearised import Linearised
-from uem_dolfinx.gradients.parameters import ContactParameter, acting, led_for, motion_of
+from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of
 from uem_dolfinx.gradients.records import Record
 from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.bodies.tangent import contact_curvature, curvature_of, together
+from uem_dolfinx.solve.bodies.tangent import contact_curvature, together
 from uem_dolfinx.solve.memory import Memory
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.system import BodySystem
@@ -243,8 +242,6 @@ class LinearisedStep(Linearised):
     def __init__(self, problem: UnitedProblem, record: Record, derivatives: Derivatives, rates: RateSlopes | None):
         super().__init__(problem, derivatives, record.held)
         self._led, self._rates = record.shares, rates
-        #: Derivatives by the anchors of each interface with friction.
-        self.slopes: list[AnchorSlopes | None] = []
         #: Derivative of the work of damping along ``a`` by the velocity ``(n,)``; 0 without damping.
         self.damped: Array | float = 0.0
 
@@ -279,16 +276,6 @@ class LinearisedStep(Linearised):
         solver = self.problem.solver
         if solver.iterative or not solver.lasting or any(self.slopes):
             self.problem.system.forget()
-
-    def stiffness_of(self, contact: Contact | None = None) -> PETSc.Mat | None:
-        """As in ``Linearised``, with the terms of friction (collective)."""
-        known, like = dict(zip(map(id, self.problem.interfaces), self.slopes)), self.config.unknowns.vector()
-        pairs = [(pair, state, known[id(pair)]) for pair, state in acting(self.problem, contact)]
-        states = [state if own is None else own.without_stuck(state) for _, state, own in pairs]
-        curvature = curvature_of([pair for pair, *_ in pairs], like, any(self.slopes), False, states=states)
-        curvature = together(curvature, self.stiffness_of_gaps(pairs))
-        turned = [part for _, state, own in pairs if own is not None for part in own.turned(state)]
-        return together(curvature, contact_curvature(turned, like) if turned else None)
 
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``Q mu`` with ``P'(K + G)'Q mu = P' forces`` (collective)."""
