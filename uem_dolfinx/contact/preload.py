@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 from mpi4py import MPI
@@ -12,7 +12,6 @@ import numpy.typing as npt
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.placement import Discretisation
@@ -62,7 +61,7 @@ class Preload(Contact):
         shortening: float | Callable[[float], float] | None = None,
         coupling: Literal["node_to_surface", "mortar"] | Callable[..., Discretisation] = "node_to_surface",
         measure: Literal["reference", "current"] = "reference",
-        heat: Conductance | Sequence[Conductance] | None = None,
+        heat: Any = None,
         name: str | None = None,
     ):
         with agreed(communicator_of(contactor) or communicator_of(target) or MPI.COMM_SELF):
