@@ -362,6 +362,15 @@ def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     return float(reduced(comm, sum(fem.assemble_scalar(part) for part in parts_of(M)), op=MPI.SUM))
 
 
+class Vector(PETSc.Vec):
+    """A vector that frees its memory when it is dropped, as its duplicates and copies do.
+
+    petsc4py keeps others as garbage until ``free_petsc_garbage``. Nothing is communicated: its communicator is in use elsewhere.
+    """
+
+    __del__ = PETSc.Vec.destroy
+
+
 def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec:
     """``(A + G) x`` of square matrices; G may be None (collective).
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from resource import RUSAGE_SELF, getrusage
+
 from mpi4py import MPI
 
 import numpy as np
@@ -74,6 +76,47 @@ def test_cells_that_are_flattened():
     assert stepper.steps_to_look(1e-3, 0.0) == 14
     assert stepper.steps_to_look(1e-3, 0.05) == 7
     assert stepper.steps_to_look(1.0, 0.0) == 0 == stepper.steps_to_look(1e-3, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("law", "contactors"),
+    [
+        ("StVenantKirchhoff", "massless"), slow("NeoHooke", "massless"), slow("StVenantKirchhoff", "massy"),
+        slow("LinearElastic", "massless"),
+    ],
+)  # fmt: skip
+def test_cells_that_turn_inside_out(law, contactors):
+    """The end of a bar that is pushed into itself ends the run when its cells have no height left, in the last state without such cells."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 10.0], [1, 10])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, velocity = fem.Function(V), fem.Function(V)
+    velocity.interpolate(lambda x: [0.0 * x[1], -80.0 * np.maximum(x[1] - 8.0, 0.0)])
+    foot = uem.Contact(s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity, scheme=uem.CentralDifferences(), contactors=contactors)
+    F = getattr(uem, law)(900.0, 0.0, kind="plane_strain").residual(u, ufl.TestFunction(V)) * ufl.dx
+    problem = uem.UnitedProblem(F, u, contacts=[foot], dynamics=dynamics, check_inversion=True)
+    with pytest.raises(uem.InvertedElementError, match="inside out|collapse"):
+        for _ in uem.time_steps(problem, end=1.0):
+            pass
+    assert np.array_equal(u.x.array, problem.committed) and not dynamics.moving
+    # elastic forces delay it
+    assert 0.0 < dynamics.time < 2.0 / 80.0
+    heights = np.sort(problem.config.x[problem.config.X[:, 0] < 0.5, 1])
+    assert COMM.size > 1 or (np.diff(heights) > 0.0).all()
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_run():
+    """Steps leave nothing behind: their vectors would fill 100 megabytes."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [60, 60])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    foot = uem.Contact(s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=(0.0, -0.01), scheme=uem.CentralDifferences())
+    F = uem.NeoHooke(1.0, 0.3, "plane_strain").residual(u, ufl.TestFunction(V)) * ufl.dx
+    steps = uem.time_steps(uem.UnitedProblem(F, u, contacts=[foot], dynamics=dynamics), end=100.0)
+    most = [max(next(steps).number and getrusage(RUSAGE_SELF).ru_maxrss for _ in range(n)) for n in (20, 60)]
+    assert reduced(COMM, float(most[1] - most[0]), op=MPI.MAX) < 20e3
 
 
 @pytest.mark.parametrize("contactors", ["massy", slow("massless")])

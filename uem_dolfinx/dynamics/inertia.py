@@ -205,7 +205,9 @@ class Dynamics(given.Sealed):
                 massy,
             )
         self.massy = self.mass.of_nodes > 0
-        self._weight = self.mass.M * self._like(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
+        self._weight = forms.product(
+            self.mass.M, self.mass.config.vector(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
+        )
 
     def add(self, one: AddedMass) -> None:
         """Add a mass at a point that moves with the nodes of its coupling (collective)."""
@@ -219,11 +221,6 @@ class Dynamics(given.Sealed):
         for one in self.added:
             found[one.inert] = True
         return found
-
-    def _like(self, values: Array) -> PETSc.Vec:
-        vector = self.mass.M.createVecRight()
-        vector.array[:] = np.ravel(values)
-        return vector
 
     def begin(self, dt: float) -> None:
         """Begin a step of length ``dt`` from the committed state."""
@@ -297,8 +294,8 @@ class Dynamics(given.Sealed):
         jump = self._a_rate * du + (self._a_past - self._acceleration)[:n]
         speed = self._v_rate * du + self._v_past[:n]
         jump[self.held] = 0.0
-        error, v = (self._like(part) for part in ((self.scheme.beta - 1 / 6) * self.dt * jump, speed))
-        return tuple(float(np.sqrt(max(part.dot(self.mass.M * part), 0.0))) for part in (error, v))  # type: ignore[return-value]
+        error, v = (self.mass.config.vector(part) for part in ((self.scheme.beta - 1 / 6) * self.dt * jump, speed))
+        return tuple(float(np.sqrt(max(part.dot(forms.product(self.mass.M, part)), 0.0))) for part in (error, v))  # type: ignore[return-value]
 
     @contextmanager
     def without_inertia(self, damping: float = 0.0) -> Iterator[None]:
@@ -319,7 +316,7 @@ class Dynamics(given.Sealed):
         """Inertia forces, which explicit steps find from the others, minus weight, to be added to the residual (collective)."""
         load = -self._weight
         if not (self.moving and isinstance(self.scheme, CentralDifferences)):
-            load.axpy(1.0, self._inertia() if self.moving else self._like(self.forces.x.array[: self._n]))
+            load.axpy(1.0, self._inertia() if self.moving else self.mass.config.vector(self.forces.x.array[: self._n]))
         if self.added:
             load.array[:] += self.added_forces()
         return load
@@ -337,9 +334,9 @@ class Dynamics(given.Sealed):
         du = self._displacement - self._u
         a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
         a[:n][self.held] = (prescribed or self._prescribed())[2]
-        inertia = self.mass.M * self._like(a[:n])
+        inertia = forms.product(self.mass.M, self.mass.config.vector(a[:n]))
         if s.alpha_f:
-            inertia.axpy(-s.alpha_f, self._like(self.forces.x.array[:n]))
+            inertia.axpy(-s.alpha_f, self.mass.config.vector(self.forces.x.array[:n]))
         inertia.scale(1.0 / (1.0 - s.alpha_f))
         return inertia
 
@@ -360,7 +357,9 @@ class Dynamics(given.Sealed):
         for one in self.added:
             one.accelerate(a.array_r[: self._n].reshape(-1, self.config.gdim))
         self._acceleration = np.array(self.acceleration.x.array)
-        self.forces.x.array[: self._n] = (self.mass.M * self._like(self._acceleration[: self._n])).array_r
+        self.forces.x.array[: self._n] = forms.product(
+            self.mass.M, self.mass.config.vector(self._acceleration[: self._n])
+        ).array_r
         self.forces.x.scatter_forward()
         self.accelerated = True
 
@@ -382,7 +381,7 @@ class Dynamics(given.Sealed):
             self.velocity.x.array[:n], self.acceleration.x.array[:n] = self.rates(known)
             self.mean_velocity.x.array[:n] = (self._displacement - self._u)[:n] / dt
             change = self.velocity.x.array[:n] - self._velocity[:n]
-            work = (self.mass.M * self._like(change)).array_r * (self._velocity[:n] + 0.5 * change)
+            work = forms.product(self.mass.M, self.mass.config.vector(change)).array_r * (self._velocity[:n] + 0.5 * change)
             self.driven += float(work[held].sum())
             for field in (self.forces, self.acceleration, self.velocity, self.mean_velocity):
                 field.x.scatter_forward()
@@ -401,7 +400,7 @@ class Dynamics(given.Sealed):
         change = np.where(free, acceleration - self.acceleration.x.array[:n], 0.0)
         self.velocity.x.array[:n] = np.where(free, velocity, self.velocity.x.array[:n])
         self.acceleration.x.array[:n] += change
-        self.forces.x.array[:n] += (self.mass.M * self._like(change)).array_r
+        self.forces.x.array[:n] += forms.product(self.mass.M, self.mass.config.vector(change)).array_r
         for field in (self.forces, self.acceleration, self.velocity):
             field.x.scatter_forward()
         self._copy_committed()
@@ -440,11 +439,11 @@ class Dynamics(given.Sealed):
 
     def momentum(self) -> Array:
         """Momentum ``(gdim,)``; in axisymmetry only along the axis (collective)."""
-        p = forms.product(self.mass.M, self._like(self.velocity.x.array[: self._n]))
+        p = forms.product(self.mass.M, self.mass.config.vector(self.velocity.x.array[: self._n]))
         sums = reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0))
         return self.config.of_circles(sums + sum(one.momentum for one in self.added))
 
     def kinetic_energy(self) -> float:
         """``v'Mv / 2``, plus the kinetic energy of masses at points (collective)."""
-        v = self._like(self.velocity.x.array[: self._n])
+        v = self.mass.config.vector(self.velocity.x.array[: self._n])
         return 0.5 * float(v.dot(forms.product(self.mass.M, v))) + sum(one.kinetic_energy for one in self.added)

@@ -73,7 +73,7 @@ class Nodes:
     def _like(self) -> PETSc.Vec:
         """Template for vectors."""
         sizes = self.block * self.n_owned, self.block * self.n_global
-        return PETSc.Vec().createMPI(sizes, bsize=self.block, comm=self.comm)
+        return forms.Vector().createMPI(sizes, bsize=self.block, comm=self.comm)
 
     def vector(self, values: npt.ArrayLike | None = None) -> PETSc.Vec:
         """A vector with these values at the owned components, or zeros."""

@@ -33,8 +33,7 @@ RESOLVED = 0.25
 #: How fast edges of cells are stretched is found anew after so many steps at most.
 #: [convention; steps; test_explicit_materials.py::test_cells_that_are_flattened]
 CHECKED_EVERY = 50
-#: The critical step is found anew before an edge is stretched by more than this part, and where a step does that; cells are checked for
-#: inversion before nodes move by this part of the shortest edge against each other.
+#: The critical step is found anew before an edge is stretched by more than this part, and where a step does that.
 #: [convention; strain; test_explicit_materials.py::test_cells_that_are_flattened]
 CHECKED_STRAIN = 0.1
 #: A step stretches no edge of a vibration by more than this part: stiffnesses that change within a step make or take energy.
@@ -76,18 +75,21 @@ class ExplicitStepper:
         self.limit = np.inf
         #: Part of the critical step that resolves closed contacts.
         self.part = 1.0
+        from scipy.sparse import csr_matrix
+
         config = problem.config
         n_vertices, dofs = len(forms.reference_topology(compat.cell_name(config.mesh))[0]), compat.cell_dofs(config.V)
         pairs = np.sort(dofs[:, np.array(np.triu_indices(n_vertices, 1))].transpose(0, 2, 1).reshape(-1, 2), axis=1)
-        #: Pairs of vertices of a cell ``(2, n)``, and, as last looked at, their shortest distance, the fastest rate of stretching and the
-        #: mean velocity of nodes.
-        self._edges = np.array(np.divmod(np.unique(pairs @ [len(config.x), 1]), len(config.x)))
-        self.shortest, self.rate, self._mean = np.inf, 0.0, np.zeros(config.gdim)
+        edges = np.column_stack(np.divmod(np.unique(pairs @ [len(config.x), 1]), len(config.x)))
+        ends = np.arange(0, edges.size + 1, 2)
+        #: Differences of nodal values between the vertices of a cell ``(n, n_local)``.
+        self._edges = csr_matrix((np.tile([1.0, -1.0], len(edges)), edges.ravel(), ends), shape=(len(edges), len(config.x)))
+        #: Shortest distance of these vertices, and the fastest rate of stretching, as last looked at.
+        self.shortest, self.rate = np.inf, 0.0
         self._of_mesh = self._lengths(config.X)
         self._least = COLLAPSED * reduced(problem.comm, float(self._of_mesh.min(initial=np.inf)), op=MPI.MIN)
-        #: How far nodes may have moved against each other since cells were checked for inversion, and whether accelerations may have
-        #: stretched them much in the last step.
-        self._moved, self.sudden = np.inf, False
+        #: Whether accelerations may have stretched cells much in the last step.
+        self.sudden = False
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
 
     def _parts(self) -> tuple[Any, Any]:
@@ -178,21 +180,17 @@ class ExplicitStepper:
             StepAccuracyError: with both lengths.
         """
         problem, bodies, config, changed = self.problem, self.problem.bodies, self.problem.config, False
-        if not bodies.linear or bodies.inversions:
-            way = config.of(problem.u.x.array - problem.committed)[: config.n_owned] - dt * self._mean
-            sizes = np.array([np.abs(a).max(initial=0.0), np.abs(way).max(initial=0.0)])
-            largest, moved = reduced(problem.comm, sizes, op=MPI.MAX)
-            least = CHECKED_STRAIN * self.shortest
-            self.sudden = not bodies.linear and 2.0 * largest * dt**2 > least
-            self._moved += 2.0 * np.sqrt(config.gdim) * moved
+        if bodies.linear:
+            # forces by a product do not show inverted cells
+            if (where := bodies.inverted()) is not None:
+                raise InvertedElementError(f"the cell at {where} is turned inside out: take a finer mesh there")
+        else:
+            largest = float(reduced(problem.comm, float(np.abs(a).max(initial=0.0)), op=MPI.MAX))
+            self.sudden = 2.0 * largest * dt**2 > CHECKED_STRAIN * self.shortest
             if self.sudden:
                 length, start = self._lengths(config.x), self._lengths(config.X + config.of(problem.committed))
                 strain = float((np.abs(length - start) / start).max(initial=0.0))
                 changed = reduced(problem.comm, strain, op=MPI.MAX) > CHECKED_STRAIN
-            if changed or self._moved > least:
-                if (where := bodies.inverted()) is not None:
-                    raise InvertedElementError(f"the cell at {where} is turned inside out: take a finer mesh there")
-                self._moved = 0.0
         if not changed and self.pattern() == before:
             return
         critical = self.critical_step()
@@ -241,11 +239,12 @@ class ExplicitStepper:
 
     def _differences(self, of: Array) -> Array:
         """Differences of nodal values ``(n_local, gdim)`` along all edges ``(n, gdim)``."""
-        return np.asarray(of[self._edges[0]] - of[self._edges[1]])
+        return np.asarray(self._edges @ of)
 
     def _lengths(self, of: Array) -> Array:
         """Lengths of these differences ``(n,)``."""
-        return np.asarray(np.linalg.norm(self._differences(of), axis=1))
+        along = self._differences(of)
+        return np.sqrt(np.einsum("ng,ng->n", along, along))
 
     def look(self, stretch: float = np.inf) -> float:
         """Find how fast the velocities stretch edges of cells, and the shortest edge (collective).
@@ -265,7 +264,6 @@ class ExplicitStepper:
         found = self._lengths(v) / length, 1.0 / length, np.abs(length / self._of_mesh - 1.0)
         self.rate, inverse, strain = reduced(self.problem.comm, np.array([of.max(initial=0.0) for of in found]), op=MPI.MAX)
         self.shortest = 1.0 / inverse
-        self._mean = reduced(self.problem.comm, v[: config.n_owned].sum(axis=0)) / config.index_map.size_global
         if self.shortest < self._least:
             raise InvertedElementError(
                 f"cells collapse: their shortest edge, {self._least / COLLAPSED:.3g} at the start, is {self.shortest:.3g}; "

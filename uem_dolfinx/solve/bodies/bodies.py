@@ -89,8 +89,10 @@ class Bodies:
         self.unknowns = config.unknowns
         self.materials, self.dynamics = list(materials), dynamics
         self.tangent = Tangent(F, config, self.materials, dynamics, points, J)
+        check = not self.tangent.linear if check_inversion is None else check_inversion
+        self.inversions = Inversions(config) if check and config.moves else None
         with compiling("the residual"):
-            self._F = forms.form(F)
+            self._F = forms.form(F if self.inversions is None else self.inversions.marked(F, dynamics))
         self._b = compat.create_vector(self.u.function_space)
         self._u = compat.petsc_vector(self.u)
         self._n_owned = len(self._b.array_r)
@@ -110,8 +112,6 @@ class Bodies:
         #: Its value at the end of the last step, with which the next starts, and the state counter of the K that it was taken from.
         self.stiffness_at_start: Array | None = None
         self._stiffness_of = -1
-        check = not self.tangent.linear if check_inversion is None else check_inversion
-        self.inversions = Inversions(config) if check and config.moves else None
         self._fields: Any = None
         self._linked: tuple[Ints, int] | None = None
         if self.unknowns.mixed:

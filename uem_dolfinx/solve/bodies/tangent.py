@@ -22,7 +22,8 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
+from uem_dolfinx.errors import InvertedElementError, NotFiniteError, SpaceError, UEMError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
@@ -296,6 +297,17 @@ class Inversions:
         with compiling("the search for cells turned inside out"):
             self._volume = forms.form(ufl.conditional(ufl.le(self._J, 0.0), one, 0.0 * one) * ufl.dx(domain=config.mesh))
 
+    def marked(self, F: ufl.Form, dynamics: Dynamics | None) -> ufl.Form:
+        """The residual that steps of ``dynamics`` assemble, F: in explicit steps NaN where points of its cells are turned inside out."""
+        if not isinstance(getattr(dynamics, "scheme", None), CentralDifferences):
+            return F
+        nothing = (
+            ufl.conditional(ufl.gt(self._J, 0.0), 0.0, fem.Constant(self.config.mesh, np.nan)) * ufl.grad(F.arguments()[0])[0, 0]
+        )
+        return ufl.Form(
+            [one.reconstruct(one.integrand() + nothing) if one.integral_type() == "cell" else one for one in F.integrals()]
+        )
+
     def find(self) -> str | None:
         """Position of the worst inverted cell, or None (collective)."""
         config = self.config
@@ -310,3 +322,10 @@ class Inversions:
             cell = int(values.argmin())
             here = (float(values[cell]), str(np.round(config.X[dofs[cell]].mean(axis=0), 6)))
         return min(config.comm.allgather(here))[1]
+
+
+def not_finite(bodies: Any, when: str, remedy: str) -> UEMError:
+    """The error for forces that are not finite: a cell is turned inside out, or there is a ``remedy`` for anything else (collective)."""
+    if (where := bodies.inverted()) is not None:
+        return InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
+    return NotFiniteError(f"the residual is not finite {when}: {remedy}")

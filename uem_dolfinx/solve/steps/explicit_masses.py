@@ -25,6 +25,7 @@ from uem_dolfinx.dynamics.explicit.mass_solver import MassSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
 from uem_dolfinx.errors import MassError, UEMError
 from uem_dolfinx.solve.bodies.bodies import Bodies
+from uem_dolfinx.solve.bodies.tangent import not_finite
 
 
 class InertBodies(Bodies):
@@ -173,7 +174,8 @@ class StepperWithMass(ExplicitStepper):
     def _accelerations(self) -> Array:
         """Accelerations of the moving components under the forces of the bodies, zero elsewhere ``(n,)`` (collective)."""
         bodies = self.problem.bodies
-        bodies.assemble()
+        if not bodies.assemble():
+            raise not_finite(bodies, "at the end of the step", "check loads and material parameters for NaN and division by zero")
         return np.asarray(-self._inverse * bodies.residual.array_r)
 
     def _highest_square(self) -> float:

@@ -16,11 +16,12 @@ from petsc4py import PETSc
 
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Ints
-from uem_dolfinx.errors import ConvergenceError, InvertedElementError, NotFiniteError
+from uem_dolfinx.errors import ConvergenceError
 from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.bodies.field_scales import driving
 from uem_dolfinx.solve.bodies.norms import Norm, first, ratio, worst
+from uem_dolfinx.solve.bodies.tangent import not_finite
 from uem_dolfinx.solve.rigid.unheld import no_precision, unheld
 
 #: A residual that keeps this part of its norm twice has met its rounding.
@@ -270,10 +271,8 @@ def solve_united(
 
     method.place()
     if not bodies.assemble():
-        raise NotFiniteError(
-            "the residual is not finite at the start of the step: "
-            "check loads, material parameters and the initial displacement for NaN and division by zero"
-        )
+        remedy = "check loads, material parameters and the initial displacement for NaN and division by zero"
+        raise not_finite(bodies, "at the start of the step", remedy)
     for k in range(max_iterations + 1):
         with _told(history):
             state = method.assemble_constraints(in_equilibrium)
@@ -408,10 +407,7 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
             if less_work or downhill or first(norms(residual)) <= enough * driving(bodies, state.test, step.rhs, step.du):
                 return length
         elif last:
-            where = bodies.inverted()
-            if where is None:
-                raise NotFiniteError("the residual is not finite even after the shortest step: take smaller load steps")
-            raise InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
+            raise not_finite(bodies, "even after the shortest step", "take smaller load steps")
         length *= 0.5
 
 
