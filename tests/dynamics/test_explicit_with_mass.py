@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from mpi4py import MPI
 
@@ -306,3 +307,47 @@ def test_a_run_that_is_continued_is_the_same(tmp_path):
     # of displacements and velocities of size 1
     assert np.allclose(again.u.x.array, whole.u.x.array, rtol=0, atol=1e-14)
     assert np.allclose(again.dynamics.velocity.x.array, whole.dynamics.velocity.x.array, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_ring_that_folds(tmp_path):
+    """A rubber ring is thrown onto a floor, where it folds and touches itself, in steps that change.
+
+    The floor's impulses are its change of momentum to rounding, energy is conserved, and a run that goes on from a checkpoint is the same.
+    """
+
+    def ring():
+        mesh, _ = uem.read_gmsh(Path(uem.__file__).parent / "meshes/ring.geo", COMM, gdim=2, parameters={"n": 32, "layers": 1})
+        V = uem.function_space(mesh, 1, (2,))
+        u, rubber = fem.Function(V), uem.NeoHooke(1.0, 0.3, kind="plane_strain")
+        contact = uem.GeneralContact(rigid=[uem.RigidPlane((0.0, -1.05), (0.0, 1.0))], friction=0.3)
+        mass, scheme = uem.lumped_mass(V, 1.0), uem.CentralDifferences()
+        dynamics = uem.Dynamics(mass, velocity=(0.18, -0.6), scheme=scheme, contactors="massy")
+        F = rubber.residual(u, ufl.TestFunction(V)) * ufl.dx
+        return uem.UnitedProblem(F, u, contacts=[contact], dynamics=dynamics), contact, rubber.energy(u) * ufl.dx
+
+    problem, contact, stored = ring()
+    n, m = problem.config.n_owned, problem.dynamics.mass.of_nodes
+    book, impulse, lengths, errors, inside = uem.EnergyBook(problem, stored), np.zeros(2), [], [], 0
+    start = reduced(COMM, m.sum(axis=0)) * [0.18, -0.6]
+    for step in uem.time_steps(problem, end=4.0):
+        book.write(step)
+        lengths.append(step.dt)
+        force = contact.force.x.array[: 2 * n].reshape(-1, 2)
+        impulse += step.dt * reduced(COMM, force.sum(axis=0))
+        momentum = reduced(COMM, (m * problem.dynamics.mean_velocity.x.array[: 2 * n].reshape(-1, 2)).sum(axis=0))
+        errors.append(np.abs(momentum - start - impulse).max())
+        inside += reduced(COMM, int(force[np.linalg.norm(problem.config.X[:n], axis=1) < 0.75].any()))
+    assert inside > 0 and max(lengths) > 2.0 * min(lengths)
+    assert max(errors) < 1e-12 * np.abs(start).max()
+    assert max(abs(row.defect) for row in book.rows) < 5e-3 * book.rows[0].kinetic
+    path, again = COMM.bcast(str(tmp_path / "run.h5")), []
+    for stop in (len(lengths) // 2, np.inf):
+        other = ring()[0]
+        for step in uem.time_steps(other, end=4.0, checkpoint=uem.Checkpoint(path, every=7)):
+            again.append(step.dt)
+            if step.number >= stop:
+                break
+    assert again == lengths or COMM.size > 1
+    change = reduced(COMM, float(np.abs(other.u.x.array - problem.u.x.array).max(initial=0.0)), op=MPI.MAX)
+    assert change == 0.0 or COMM.size > 1

@@ -99,8 +99,8 @@ class Dynamics(given.Sealed):
         self.time = self.start = self._until = float(time)
         self.start_velocity, self.gravity = velocity, gravity
         self.resumed, self.accelerated, self.moving, self._attached = 0, False, False, False
-        #: Length of the last committed step, and the factor of M in the tangent.
-        self._last = self.factor = self.driven = self.dt = 0.0
+        #: Length of the last committed step, zero before the first, and the factor of M in the tangent.
+        self.last = self.factor = self.driven = self.dt = 0.0
         #: Masses at points of rigid couplings.
         self.added: list[AddedMass] = []
         #: Virtual work of the damping forces.
@@ -242,7 +242,7 @@ class Dynamics(given.Sealed):
         signs differ. This is of second order for smooth motions, and equal to w after a jump, which is then an impact within the step.
         Accelerations are differences of v, extrapolated to the time of the equation of motion.
         """
-        i, dt, last = self.held, self.dt, self._last
+        i, dt, last = self.held, self.dt, self.last
         v, before = self._velocity[: self._n][i], self._acceleration[: self._n][i]
         w = (self._displacement - self._u)[: self._n][i] / dt
         slope = 2.0 * (w - self.mean_velocity.x.array[: self._n][i]) / (dt + last)
@@ -264,11 +264,11 @@ class Dynamics(given.Sealed):
         """Initial state of the next step."""
         fields = self.velocity, self.acceleration, self.mean_velocity, self.forces
         kept, added = [np.array(field.x.array) for field in fields], [one.kept for one in self.added]
-        return self.time, self._last, self.driven, self._u, kept, added
+        return self.time, self.last, self.driven, self._u, kept, added
 
     def remember(self, memory: DynamicsMemory) -> None:
         """Restore the state that ``memory`` returned."""
-        self.time, self._last, self.driven, displacement, kept, added = memory
+        self.time, self.last, self.driven, displacement, kept, added = memory
         for field, values in zip((self.velocity, self.acceleration, self.mean_velocity, self.forces), kept):
             field.x.array[:] = values
         self.restore()
@@ -385,7 +385,7 @@ class Dynamics(given.Sealed):
             self.driven += float(work[held].sum())
             for field in (self.forces, self.acceleration, self.velocity, self.mean_velocity):
                 field.x.scatter_forward()
-            self.time, self._last, self.moving = self._until, dt, False
+            self.time, self.last, self.moving = self._until, dt, False
         for one in self.added:
             one.commit()
         self._copy_committed()
@@ -412,14 +412,14 @@ class Dynamics(given.Sealed):
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers of a checkpoint in addition to the Functions, by name."""
-        kept = {"time": self.time, "start": self.start, "accelerated": self.accelerated, "last length": self._last}
+        kept = {"time": self.time, "start": self.start, "accelerated": self.accelerated, "last length": self.last}
         kept |= {} if self.damping is None else {"rate in damping": float(self._rate.value)}
         return kept | ({"masses at points": [np.array(one.kept).tolist() for one in self.added]} if self.added else {})
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restart from the present Functions and the numbers of ``to_checkpoint``; other numbers are ignored."""
         names = "time", "start", "accelerated", "last length"
-        self.time, self.start, self.accelerated, self._last = (kept[name] for name in names)
+        self.time, self.start, self.accelerated, self.last = (kept[name] for name in names)
         self.resumed += 1
         if self.damping is not None:
             self._rate.value = kept["rate in damping"]

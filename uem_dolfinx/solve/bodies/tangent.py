@@ -308,24 +308,25 @@ class Inversions:
             [one.reconstruct(one.integrand() + nothing) if one.integral_type() == "cell" else one for one in F.integrals()]
         )
 
-    def find(self) -> str | None:
-        """Position of the worst inverted cell, or None (collective)."""
+    def find(self, vertices: bool = False) -> str | None:
+        """Position of the worst cell that is inverted at its middle, or at one of its ``vertices``; or None (collective)."""
         config = self.config
-        if forms.assemble_scalar(self._volume, config.comm) == 0.0:
+        if not vertices and forms.assemble_scalar(self._volume, config.comm) == 0.0:
             return None
-        determinant = fem.Function(compat.function_space(config.mesh, ("DG", 0)))
+        determinant = fem.Function(compat.function_space(config.mesh, ("DG", int(vertices))))
         forms.interpolation(determinant, self._J)()
-        values = determinant.x.array[: determinant.function_space.dofmap.index_map.size_local]
-        dofs = compat.cell_dofs(config.V)
+        least = determinant.x.array[compat.cell_dofs(determinant.function_space)].min(axis=1, initial=np.inf)
         here = (np.inf, "")
-        if len(values):
-            cell = int(values.argmin())
-            here = (float(values[cell]), str(np.round(config.X[dofs[cell]].mean(axis=0), 6)))
-        return min(config.comm.allgather(here))[1]
+        if len(least):
+            cell = int(least.argmin())
+            here = (float(least[cell]), str(np.round(config.X[compat.cell_dofs(config.V)[cell]].mean(axis=0), 6)))
+        worst, where = min(config.comm.allgather(here))
+        return where if worst <= 0.0 or not vertices else None
 
 
 def not_finite(bodies: Any, when: str, remedy: str) -> UEMError:
     """The error for forces that are not finite: a cell is turned inside out, or there is a ``remedy`` for anything else (collective)."""
-    if (where := bodies.inverted()) is not None:
+    inversions = bodies.inversions
+    if inversions is not None and (where := inversions.find() or inversions.find(vertices=True)) is not None:
         return InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
     return NotFiniteError(f"the residual is not finite {when}: {remedy}")

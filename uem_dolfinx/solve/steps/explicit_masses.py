@@ -120,8 +120,11 @@ class StepperWithMass(ExplicitStepper):
     def step(self, dt: float) -> Any:
         """Take a step of length ``dt`` and commit it; returns the history of iterations for contact (collective)."""
         problem, dynamics, bodies, n = self.problem, self.dynamics, self.bodies, self._n
-        half = dynamics.velocity.x.array[:n] + 0.5 * dt * dynamics.acceleration.x.array[:n]
-        begin = problem.committed[:n]
+        v, a, mean = (of.x.array[:n] for of in (dynamics.velocity, dynamics.acceleration, dynamics.mean_velocity))
+        half, begin = v + 0.5 * dt * a, problem.committed[:n]
+        if last := dynamics.last:
+            # contact does not act between the middles of steps of other length, either
+            half += (1.0 - dt / last) * (0.25 * last * a - 0.5 * (v - mean))
         free_to = np.array(problem.committed)
         free_to[:n] += dt * half
         compat.set_bc_values(free_to, bodies.bcs)
