@@ -45,7 +45,6 @@ class NodeToSurface(OnTarget):
     ends_hold: bool | Bools = True
     #: In place of ``ConcaveEdges``, see ``follow_by``.
     _edges: Any = None
-    #: Which contactors are left to other equations, see ``leave``.
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)

@@ -42,6 +42,7 @@ class OnTarget:
     """
 
     traits: Traits
+    #: Which contactors are left to other equations, see ``leave``.
     _leaves: Sequence[Callable[[FacetProjection], Bools]] = ()
 
     def __init__(
