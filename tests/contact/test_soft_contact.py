@@ -392,3 +392,28 @@ def test_what_a_slide_stores(degree):
     (coarse, _), (fine, gained) = slid(4), slid(8)
     # Simpson's rule
     assert (4 * fine - coarse) / 3 == pytest.approx(gained, rel=5e-3)
+
+
+@pytest.mark.slow
+def test_averaged_normals_last_until_the_end_of_a_step():
+    """A free block on a polygonal bowl, whose contactors alternate between facets: forces at the end are the loads."""
+
+    def bend(x):
+        return np.column_stack([x[:, 0], x[:, 1] + 0.3 * (x[:, 0] - 0.5) ** 2])
+
+    def at_height(h):
+        return lambda x: np.abs(x[:, 1] - 0.3 * (x[:, 0] - 0.5) ** 2 - h) < 1e-9
+
+    parts = [([-0.5, -1.0], [1.5, 0.0], [4, 3]), ([0.0, 0.0], [1.0, 1.0], [3, 3])]
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", *part).mapped(bend) for part in parts])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    lid = s.tag("lid", 1, at_height(1.0))
+    load = fem.Constant(s.mesh, 0.0)
+    F = linear(u, 1.0) + load * v[1] * uem.ds(lid)
+    foot, top = s.tag("foot", 1, at_height(0.0)), s.tag("top", 0, at_height(0.0))
+    contact = uem.Contact(foot, top, normal=uem.SoftContact(100.0), max_penetration=0.5)
+    bcs = clamp(V, s.tag("base", 0, at_height(-1.0)))
+    run(uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load={load: 0.02}, rtol=1e-10), 2)
+    length = uem.integrate(fem.Constant(s.mesh, 1.0) * uem.ds(lid))
+    assert contact.resultant().force == pytest.approx([0.0, 0.02 * length], rel=1e-8, abs=1e-10 * length)

@@ -317,7 +317,10 @@ class SoftInterface(Interface):
         known = self.trial.law_gap
         kept = None if known is None else np.where(self._holds, self._at, np.inf)
         self.trial = replace(self.trial, passed=self.trial.passed & ~self.united, law_gap=kept, damping=self._damping(True))
+        pressing = self.united & (self.trial.changes >= MOST_CHANGES)
         super().commit()
+        # forces are those of the gaps, along the averaged normals that they have been found with
+        self.trial = self.committed = replace(self.committed, changes=np.where(pressing, MOST_CHANGES, 0))
 
     def _damping(self, presses: bool) -> Array | None:
         """The state of damping ``(n, 5)``, at the end of a step or, unless it ``presses``, at the start; None without (collective)."""
