@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, cross_products, replace
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, replace
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
@@ -328,8 +328,6 @@ class MeshTarget:
         # only a vertex of a facet may lie on the end of the surface
         at_end = (on_side & is_open).any(axis=1) | ((tab.N > 1 - ON_SIDE) & feet.open_nodes).any(axis=1)
         beyond[~at_end] = 0.0
-        if self.shape.dim > 1 and beyond.any():
-            self._across_open_sides(beyond, on_side & is_open, tab, x, facet_normal)
         from_end = np.where(is_open, self.shape.side_distances(xi), np.inf).min(axis=1, initial=np.inf)
         from_end[at_end] = 0.0
         return FacetProjection(
@@ -348,20 +346,6 @@ class MeshTarget:
             tab.ddN,
             shape_operator,
         )
-
-    def _across_open_sides(self, beyond: Array, open_here: Bools, tab: Tabulated, x: Array, normals: Array) -> None:
-        """Leave of ``beyond (n, gdim)`` the part across the open side where closest points are on one such side, in place.
-
-        Along this side the surface goes on over other facets, which may bend away from the facet's plane.
-        """
-        i = np.flatnonzero((open_here.sum(axis=1) == 1) & beyond.any(axis=1))
-        along = np.array([D[0] for _, _, _, D in self.shape.edges])[open_here[i].argmax(axis=1)]
-        m = cross_products(np.einsum("kaf,kf,kag->kg", tab.dN[i], along, x[i]), normals[i])
-        m /= np.linalg.norm(m, axis=1, keepdims=True)
-        out = np.sign(np.einsum("kg,kg->k", m, np.einsum("ka,kag->kg", tab.N[i], x[i]) - x[i].mean(axis=1)))
-        way = out * np.einsum("kg,kg->k", m, beyond[i])
-        way[way <= ON_SIDE * np.linalg.norm(x[i, 0] - x[i, 1], axis=1)] = 0.0
-        beyond[i] = (way * out)[:, None] * m
 
 
 def _nearest(points: Ints, distance: Array, facing: Array, key: Ints, rounding: float, cosine: Array | None = None) -> Ints:
