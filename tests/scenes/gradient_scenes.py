@@ -181,8 +181,7 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM):
 
     ``solve()`` takes the steps anew with the present values of all that the solution depends on; ``values`` are those of the contact.
     """
-    # no vertices opposite to vertices: behind a concave one both facets hold contactors, through which histories have no derivatives
-    b = blocks(comm, cell, *((3, 4) if cell == "triangle" else (2, 3)), overhang=0.3 if cell == "triangle" else 0.25)
+    b = blocks(comm, cell, *((3, 4) if cell == "triangle" else (2, 3)), overhang=0.25)
     mesh, g, u, v = b.scene.mesh, b.gdim, b.u, ufl.TestFunction(b.V)
     E, top, full = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.zeros(g)), fem.Constant(mesh, np.zeros(g))
     top.value[0], top.value[-1] = 0.03, -0.05

@@ -132,7 +132,8 @@ class ConcaveEdges:
         known = (state.facet == number) | (state.held == number[:, None]).any(axis=1) | (state.facet < 0)
         free = state.active & ~left & (state.changes < MOST_CHANGES)
         moved = ~known & free
-        i, tied = np.flatnonzero(moved), self._at_bends(nearest, known & free & ~state.in_corner)
+        slippery = self._of.setting.cones is None
+        i, tied = np.flatnonzero(moved), self._at_bends(nearest, known & free & ~state.in_corner & slippery)
         facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
         settled = ~moved & ~left & ~state.in_corner
         facet[settled] = number[settled]
@@ -175,7 +176,7 @@ class ConcaveEdges:
     def _between(self, nearest: FacetProjection, points: Array, state: PairState, which: Ints) -> tuple[Ints, Ints]:
         """Contactors of ``which (k,)`` that are as deep in a further facet as in their own, with this facet in ``held`` (collective).
 
-        With one of the two normals, which would be arbitrary, the force would lean to one side.
+        With one of the two normals, which would be arbitrary, a frictionless force would lean to one side; friction holds the contactor.
         """
         none = np.full((len(which), self.config.gdim - 1), -1)
         out = nearest.foot[which] - nearest.x[which].mean(axis=1)
