@@ -80,7 +80,7 @@ class Sliding:
         self._last: LastStep | None = None
         self.pivot = Pivot.begin(np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
         #: The last state and what its limits depend on, and these limits.
-        self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 5, (np.zeros(n), np.zeros(n))
+        self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 6, (np.zeros(n), np.zeros(n))
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set the law and the values of its parameter ``(n,)``."""
@@ -163,6 +163,10 @@ class Sliding:
     def bound(self, state: PairState, lam: Array | None = None) -> Array:
         """Limit of the tangential force in a state, or with other normal forces ``lam (n,)``: ``(n,)``."""
         return self.limits.of(state.lam if lam is None else lam, self.slipping(state))[0]
+
+    def hold_limits(self, lam: Array | None) -> Array:
+        """Fix the limits at normal forces ``lam (n,)``; see ``Limits.hold``."""
+        return self.limits.hold(lam)
 
     def _cone(self, state: PairState) -> tuple[Array, Array]:
         if any(map(is_not, of := (state, *self.limits.given), self._cones[0])):

@@ -86,6 +86,10 @@ class FrictionViolations(Violations):
         own = super().among(kept)
         return replace(self, **vars(own), slide=self.slide & kept, hold=self.hold & kept)
 
+    def of_contact(self) -> FrictionViolations:
+        """The violations of the contact conditions: contactors that enter or are released."""
+        return self.among(self.enter | self.release)
+
     def on_first_touch(self, gap: Array, depth: float) -> FrictionViolations:
         """See ``Violations``; violations of friction are kept."""
         return replace(self, **vars(super().on_first_touch(gap, depth)))

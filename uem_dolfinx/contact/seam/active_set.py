@@ -69,6 +69,10 @@ class Violations:
         """The violations of ``kept (n,)`` contactors."""
         return Violations(self.enter & kept, self.release & kept)
 
+    def of_contact(self) -> Violations:
+        """The violations of the contact conditions."""
+        return self
+
     def on_first_touch(self, gap: Array, depth: float) -> Violations:
         """Entering contactors of at least this ``depth``, a length, and all released ones; ``gap (n,)`` are deciding gaps."""
         return Violations(self.enter & (gap <= -depth), self.release)
