@@ -98,7 +98,7 @@ class Exchanges:
         convex: whether terms of the curvature that could make the tangent indefinite are neglected. Beyond a limit point, Newton's
             method does not leave the path by itself; with a convex tangent the bodies reach another equilibrium of lower energy.
         frozen: whether stick and slip states are fixed until the bodies have moved.
-        held: whether limits of friction are fixed.
+        held: whether limits of friction are fixed; see test_friction_moving_targets.py::test_a_slender_block_on_a_turntable.
         again: whether the linearised problem must be solved again with other limits of friction, even without changes of state.
     """
 
