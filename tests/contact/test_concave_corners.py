@@ -13,7 +13,7 @@ import pytest
 import ufl
 from corner_scenes import InCorner, boundary, groove, notched, pit, upright
 from dolfinx import fem
-from helpers import at, box, clamp, scene
+from helpers import at, box, clamp, scene, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -90,6 +90,18 @@ def test_a_wedge_that_friction_would_lock(friction):
         assert step.cuts == 0 and s.inside() <= 1e-12
         forces.append(s.contact.resultant().force)
     assert forces[1][1] > 1e-3 and np.abs(forces[-1]).max() == 0.0
+
+
+@pytest.mark.parametrize("law", [uem.Tresca(3e-3), slow(uem.Coulomb(1.0, limit=3e-3))])
+def test_work_of_a_limit_in_a_corner(law):
+    """A law with a limit rubs in the corner, too: four steps have the work of sixteen, though two of them end in the corner."""
+    works = []
+    for steps in (4, 16):
+        s = groove("triangle", 90.0, 45.0, 22.5, (0.01, 0.02), (0.0, -0.07), friction=law)
+        loaded(s, steps)
+        assert COMM.allreduce(int(s.contact.pair.trial.in_corner.sum())) == 1
+        works.append(s.contact.dissipation)
+    assert works[0] == pytest.approx(works[1], rel=0.1)
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])

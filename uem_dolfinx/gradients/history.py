@@ -352,7 +352,7 @@ class History(given.Sealed):
             forms.values_of(m)[...] = value
         for pair, mu in zip(self.problem.interfaces, friction):
             if pair.friction is not None and mu is not None:
-                pair.discretisation.set(cones=pair.friction.limits.change(mu))
+                pair.friction.limits.change(mu)
         for pair, offset in zip(self.problem.pairs, offsets):
             there = pair.discretisation.setting.offset
             if there is not offset and (there is None or offset is None or not np.array_equal(there, offset)):

@@ -39,17 +39,20 @@ class Limits:
         #: Normal forces at which limits are fixed ``(n,)``, or None.
         self._held: Array | None = None
 
-    def set(self, law: FrictionLaw, value: Array) -> Array:
-        """Set a law and the values of its parameter ``(n,)``; returns the slopes of the cones at zero force (collective)."""
-        self.law = law
+    def set(self, law: FrictionLaw, value: Array) -> None:
+        """Set a law and the values of its parameter ``(n,)`` (collective)."""
+        self.law, self.value = law, value
         self.area = self.areas_of(None) if law.per_area else np.zeros(len(value))
         self.speed = np.zeros(len(value))
-        return self.change(value)
 
-    def change(self, value: Array) -> Array:
-        """Set other values of the parameter ``(n,)``; returns the same as ``set``."""
+    def change(self, value: Array) -> None:
+        """Set other values of the parameter ``(n,)``."""
         self.value = value
-        return self.law.limit(value, np.zeros(len(value)), self.area)[1]
+
+    def cones(self, lam: Array) -> Array:
+        """Slopes of the cones that contain all forces which stick at normal forces ``lam (n,)``."""
+        limit, slope = self._stuck(lam)
+        return np.where(lam > 0, limit / np.where(lam > 0, lam, 1.0), slope)
 
     @property
     def given(self) -> tuple[Any, ...]:

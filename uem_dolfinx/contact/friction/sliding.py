@@ -84,7 +84,8 @@ class Sliding:
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set the law and the values of its parameter ``(n,)``."""
-        self.discretisation.set(cones=self.limits.set(law, value))
+        self.limits.set(law, value)
+        self.discretisation.set(cones=self.limits.cones)
 
     @property
     def value(self) -> Array:
@@ -102,7 +103,7 @@ class Sliding:
             self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion)
         self.limits.grow(kinematics)
         if (value := self._value_now(kinematics)) is not None:
-            self.discretisation.set(cones=self.limits.change(value))
+            self.limits.change(value)
         self.replace(kinematics)
 
     def replace(self, kinematics: Kinematics) -> None:
@@ -422,12 +423,13 @@ class Sliding:
 
     def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
         """Friction at a step's end, slips per unit of friction at start and end ``(n, gdim)``, and dissipation ``(n,)`` (collective)."""
-        share, held, (_, slope) = kinematics.ties.share[:, None], self.frame.cornered[:, None], self._cone(state)
+        share, held = kinematics.ties.share[:, None], self.frame.cornered[:, None]
         # a contactor that stuck throughout the step is at its anchor, up to rounding
         stuck = (self._at_anchors(state) & self._at_anchors(committed))[:, None]
         start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
         # in a corner, friction is the part within the cones of its facets
-        tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slope, end) * share, _of(state).tau)
+        slopes = self.limits.cones(np.linalg.norm(state.force, axis=1))
+        tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slopes, end) * share, _of(state).tau)
         return tau, start, end, stick_slip.work(_of(committed).tau, tau, start, end, self.frame.cornered)
 
     def forget(self) -> None:

@@ -103,7 +103,8 @@ class ConcaveEdges:
             return state, left
         i = corners.which
         cones = self._of.setting.cones
-        pulls = corners.pulls(state.force[i], np.zeros(len(i)) if cones is None else cones[i])
+        slopes = np.zeros(len(i)) if cones is None else cones(np.linalg.norm(state.force, axis=1))[i]
+        pulls = corners.pulls(state.force[i], slopes)
         leaving = (pulls < 0).any(axis=1) | ~state.active[i]
         facets = np.column_stack([state.facet[i], state.held[i]])
         rows = np.flatnonzero(leaving)

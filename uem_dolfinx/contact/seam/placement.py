@@ -367,7 +367,7 @@ class Setting(NamedTuple):
         mutual: contacts whose contactors and target follow each other (two-pass) ``(n_contacts,)``.
         label: number of the contact of each contactor ``(n,)``.
         offset: heights minus gaps ``(n,)``; None without offset.
-        cones: slopes of the contactors' cones of friction ``(n,)``; None without friction.
+        cones: slopes of the contactors' cones of friction ``(n,)`` at normal forces ``(n,)``; None without friction.
     """
 
     free: Bools
@@ -377,7 +377,7 @@ class Setting(NamedTuple):
     mutual: Bools
     label: Ints
     offset: Array | None = None
-    cones: Array | None = None
+    cones: Callable[[Array], Array] | None = None
 
 
 class Discretisation(Protocol):
