@@ -175,9 +175,9 @@ def turning(
     length = np.linalg.norm(rows.parts, axis=2, keepdims=True)
     outward = rows.parts / np.where(length > 0, length, 1.0)
     for some, nodes, blocks in own_curvature(at, there[:, :, 0]):
-        own, (p, width) = -blocks.swapaxes(2, 3), nodes.shape
+        own = -blocks.swapaxes(2, 3)
         longer = np.einsum("pjg,pjwgh->pjwh", outward[_places(at.nodes, nodes[:, :nc])][:, some], own)
-        columns = [own.reshape(p, -1, width, g * g), longer, np.zeros((*longer.shape[:3], g))]
+        columns = [own.reshape(*own.shape[:3], g * g), longer, np.zeros((*longer.shape[:3], g))]
         parts.append(terms_of(nodes[:, :nc][:, some], nodes, np.concatenate(columns, axis=3)))
     row, term, value = elimination.at_owners(parts, np.ones(n))
     values = np.zeros((len(row) + len(weights[0]) + len(which), 1 + g * g + 2 * g))
