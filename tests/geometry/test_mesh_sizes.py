@@ -9,10 +9,11 @@ from mpi4py import MPI
 import basix
 import numpy as np
 import pytest
+from helpers import slow
 
 import uem_dolfinx as uem
 from uem_dolfinx.accuracy.adapt import cell_sizes
-from uem_dolfinx.geometry.mesh_sizes import FILLED_BY, MeshSizes, graded
+from uem_dolfinx.geometry.mesh_sizes import FILLED_BY, SUBDIVIDED, MeshSizes, graded
 
 COMM = MPI.COMM_WORLD
 
@@ -55,6 +56,30 @@ def test_gmsh_follows(name, gdim):
         number.append(COMM.allreduce(len(own)))
         assert 0.7 < COMM.allreduce(own.sum()) / number[-1] / (factor * usual) < 1.5
     assert 0.6 * 2**gdim < number[1] / number[0] < 1.5 * 2**gdim
+
+
+@pytest.mark.parametrize("h", [slow(0.75), slow(1.5), 3.0])
+@pytest.mark.parametrize("quads", [False, True])
+def test_arcs_outside_coarse_cells(quads, h, tmp_path):
+    """Along an arc cells have the disc's sizes, not the block's that it touches, though first sides of the radius run far inside."""
+    path, radius, disc, block = COMM.bcast(tmp_path) / "disc.geo", 3.0, 0.05, 0.1
+    if COMM.rank == 0:
+        subdivided = "\nRecombine Surface {1, 2};\nMesh.SubdivisionAlgorithm = 1;\n" * quads
+        path.write_text(uem.example_mesh("adapt_hertz").read_text() + subdivided)
+    COMM.barrier()
+    mesh, tags = uem.read_gmsh(path, COMM, gdim=2, parameters={"h": h})
+    sizes = np.full(len(cell_sizes(mesh)), block)
+    owned = tags["disc"].entities
+    sizes[owned[owned < len(sizes)]] = disc
+    finer, _ = uem.read_gmsh(path, COMM, gdim=2, parameters={"h": h}, size=MeshSizes(mesh, sizes))
+    x, y = finer.geometry.x[:, 0], radius - finer.geometry.x[:, 1]
+    there = np.isclose(np.hypot(x, y), radius, rtol=1e-9) & (y > -1e-9)
+    angles = np.sort(np.concatenate(COMM.allgather(np.arctan2(x, y)[there])))
+    sides = radius * np.diff(angles[angles > 0.1])
+    # on lines of quadrilaterals Gmsh's sizes are larger, and halved
+    wanted = disc * (SUBDIVIDED / 2 if quads else 1.0)
+    sides = sides[sides > 1e-6 * wanted] / wanted
+    assert sides.min() > 0.9 and sides.max() < 1.1 and np.isclose(sides.sum() * wanted, radius * (np.pi / 2 - 0.1), rtol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -31,9 +31,8 @@ OTHERS = {
 #: [convention; size; test_mesh_sizes.py::test_subdivided_cells_have_their_sizes]
 SUBDIVIDED = 2.5
 
-
 #: Copies of simplices at the boundary are so many times as large, so that they reach to arcs of 90 degrees along a side.
-#: [convention; size of a cell; test_adapt.py::test_cells_in_space]
+#: [convention; size of a cell; test_mesh_sizes.py::test_arcs_outside_coarse_cells]
 ENLARGED = 2.0
 
 
@@ -71,19 +70,23 @@ class MeshSizes:
     def within(self, gmsh: Any) -> Iterator[None]:
         """Mesh with these sizes, on rank 0."""
         before = {name: gmsh.option.getNumber(name) for name in OTHERS}
-        view = gmsh.view.add("sizes")
-        corners = np.array(FILLED_BY[self.cell])
+        corners, field = np.array(FILLED_BY[self.cell]), gmsh.model.mesh.field
         gdim, k = self.points.shape[2], corners.shape[1]
         points, values = self.points[:, corners].reshape(-1, k, gdim), self.values[:, corners].reshape(-1, k)
-        if k == 4:
-            points, values = _beyond(points, values)
-        x = np.zeros((len(points), 3, k))
-        x[:, :gdim] = points.transpose(0, 2, 1)
-        data = np.concatenate([x.reshape(len(x), -1), values], axis=1)
-        gmsh.view.addListData(view, "ST" if k == 3 else "SS", len(x), data.ravel().tolist())
-        field = gmsh.model.mesh.field.add("PostView")
-        gmsh.model.mesh.field.setNumber(field, "ViewTag", view)
-        gmsh.model.mesh.field.setAsBackgroundMesh(field)
+        views, fields = [], []
+        for x, at in ((points, values), _beyond(points, values)):
+            lists = np.zeros((len(x), 3, k))
+            lists[:, :gdim] = x.transpose(0, 2, 1)
+            views.append(gmsh.view.add("sizes"))
+            data = np.concatenate([lists.reshape(len(x), -1), at], axis=1)
+            gmsh.view.addListData(views[-1], "ST" if k == 3 else "SS", len(x), data.ravel().tolist())
+            fields.append(field.add("PostView"))
+            field.setNumber(fields[-1], "ViewTag", views[-1])
+        # Gmsh 4.8 finds any of the simplices that hold a point, and a huge size without one: copies count outside the bodies alone
+        both, none = field.add("MathEval"), 2 * values.max()
+        body, copies = (f"F{tag}" for tag in fields)
+        field.setString(both, "F", f"{body} * step({none} - {body}) + {copies} * step({body} - {none})")
+        field.setAsBackgroundMesh(both)
         try:
             for name, value in OTHERS.items():
                 gmsh.option.setNumber(name, value)
@@ -93,13 +96,14 @@ class MeshSizes:
         finally:
             for name, value in before.items():
                 gmsh.option.setNumber(name, value)
-            gmsh.view.remove(view)
+            for view in views:
+                gmsh.view.remove(view)
 
 
 def _beyond(points: Array, values: Array) -> tuple[Array, Array]:
-    """Simplices ``(m, k, gdim)`` and their values ``(m, k)``, with copies at the boundary that reach to curved surfaces outside.
+    """Copies of simplices ``(m, k, gdim)`` at the boundary and of their values ``(m, k)``, which reach to curved boundaries outside.
 
-    Gmsh 4.8 knows no size where there is no simplex, and meshes such surfaces in space much coarser; curves in the plane keep theirs.
+    Gmsh 4.8 knows no size where there is no simplex, and meshes such boundaries much coarser.
     """
     m, k = values.shape
     vertex = np.unique(points.reshape(m * k, -1), axis=0, return_inverse=True)[1].reshape(m, k)
@@ -107,9 +111,8 @@ def _beyond(points: Array, values: Array) -> tuple[Array, Array]:
     alone, times = np.unique(facets, axis=0, return_counts=True)
     outside = np.isin(vertex, alone[times == 1]).any(axis=1)
     middle, mean = points[outside].mean(axis=1, keepdims=True), values[outside].mean(axis=1, keepdims=True)
-    larger = middle + ENLARGED * (points[outside] - middle)
     there = np.maximum(mean + ENLARGED * (values[outside] - mean), values[outside].min(axis=1, keepdims=True))
-    return np.concatenate([points, larger]), np.concatenate([values, there])
+    return middle + ENLARGED * (points[outside] - middle), there
 
 
 def _unique(numbers: Ints) -> tuple[Ints, int]:
