@@ -170,7 +170,7 @@ class ConcaveEdges:
     def _at_bends(self, nearest: FacetProjection, which: Bools) -> Ints:
         """Contactors of ``which (n,)`` whose closest points are at a concave side or vertex of their facets ``(k,)``."""
         i = np.flatnonzero(which)
-        i = i[(self.target.shape.side_distances(nearest.xi[i]) < ON_SIDE).any(axis=1) & ~nearest.beyond[i].any(axis=1)]
+        i = i[(self.target.shape.side_distances(nearest.xi[i]) < ON_SIDE).any(axis=1)]
         out = nearest.foot[i] - nearest.x[i].mean(axis=1)
         return i[np.einsum("kg,kg->k", nearest.averaged[i], out) < -ON_PLANE * nearest.facet_size[i]]
 

@@ -133,7 +133,7 @@ class Interface:
         anchored = self.friction.anchored(self.trial, self.kinematics) if self.friction is not None else None
         k = self.kinematics
         state = active_set.touching(self.trial, k.gap, self.config.size, which & ~self.off & k.movable)
-        self.take(replace(state, at_end=k.ends.held(self.trial)))
+        self.take(replace(state, at_end=k.ends.drawn(self.trial)))
         if anchored is not None and self.trial.friction is not None:
             self.trial = replace(self.trial, friction=replace(anchored, stick=self.trial.friction.stick))
         # a first step that fails and is cut starts again from this state

@@ -280,7 +280,7 @@ class SoftInterface(Interface):
         """None, but ends hold contactors that touch there, and pressures begin to act (collective)."""
         self.trial = self.committed = replace(
             self.trial,
-            at_end=self.kinematics.ends.held(self.trial),
+            at_end=self.kinematics.ends.drawn(self.trial),
             law_gap=np.full(len(self.nodes), np.inf),
             damping=self._damping(False),
         )

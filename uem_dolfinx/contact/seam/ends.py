@@ -8,7 +8,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, replace
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.geometry.projection import Projection
+from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import ON_SIDE
 
 #: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
@@ -28,6 +28,7 @@ class Ends:
     ========================================  ====================  =========================================================
     slides to an end                                                past the end to rounding (``ON_SIDE``)
     came to the end, or was drawn there       ``at_end``            past it by ``END_HOLDS`` of a facet: a blow is spared
+    was drawn in a concave bend at the end    ``at_end``            the same: facets bend towards it, as in a tube of its length
     has slid off in this step                 ``at_end, passed``    past the end to rounding; under mortar until
                                                                     ``COVERED_AGAIN`` of its share is covered
     had slid off before, is behind the plane  ``passed``            past the end to rounding
@@ -73,6 +74,13 @@ class Ends:
         """
         near = (self.projection.from_end <= END_HOLDS) & ~self.past(state) & self.holds
         return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
+
+    def drawn(self, state: PairState) -> Bools:
+        """Contactors held by an end in the first step ``(n,)``: those drawn behind a concave bend there are not past it."""
+        p = self.projection
+        if isinstance(p, FacetProjection):
+            state = replace(state, at_end=state.at_end | (p.way_beyond < p.behind_bends))
+        return self.held(state)
 
     def near(self, state: PairState, reach: float) -> Bools:
         """Contactors that are active, or not past an end and within one facet of the target, or ``reach`` of a rigid one ``(n,)``."""

@@ -55,7 +55,7 @@ def check_initial(pair: Interface) -> dict[int, float]:
     Raises:
         PenetrationError: naming the deepest node of the first rank with such a node.
     """
-    gap = np.where(pair.off, np.inf, pair.kinematics.projection.gap)
+    gap = np.where(pair.off & ~pair.kinematics.ends.drawn(pair.trial), np.inf, pair.kinematics.projection.gap)
     error = None
     if len(pair.members) > 1:
         some = reduced(pair.config.comm, bool((gap < -TOUCHING * pair.config.size).any()), op=MPI.LOR)
