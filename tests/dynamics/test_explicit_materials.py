@@ -121,7 +121,7 @@ def test_the_memory_of_a_run():
 
 @pytest.mark.parametrize("contactors", ["massy", slow("massless")])
 def test_rubber_at_the_speed_of_its_waves(contactors):
-    """Edges of crushed cells are stretched by at most a tenth in a step, and energy neither grows nor falls."""
+    """Crushed cells are strained by at most a tenth in a step, and energy neither grows nor falls."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 7.0], [1, 7])])
     V = compat.function_space(s.mesh, 1, (2,))
     u = fem.Function(V)
@@ -134,12 +134,46 @@ def test_rubber_at_the_speed_of_its_waves(contactors):
     book = uem.EnergyBook(problem, rubber.energy(u) * ufl.dx)
     for step in uem.time_steps(problem, end=1.5):
         book.write(step)
-        before, lengths = lengths, stepper._lengths(problem.config.x)
+        before, lengths = lengths, stepper._slopes(problem.config.x)[1, 1]
         if step.number > 5:
             strains.append(float(np.abs(lengths / before - 1).max(initial=0.0)))
     strain = COMM.allreduce(max(strains), op=MPI.MAX)
     assert 0.03 < strain < 0.11
     assert max(abs(row.defect) for row in book.rows) < 2e-3 * book.rows[0].kinetic
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contactors", ["massy", "massless"])
+@pytest.mark.parametrize("speed", [0.5, 1.0, 1.2])
+@pytest.mark.parametrize(
+    ("cell", "law"),
+    [
+        ("quadrilateral", "NeoHooke"),
+        ("triangle", "NeoHooke"),
+        ("quadrilateral", "StVenantKirchhoff"),
+        ("triangle", "LinearElastic"),
+    ],
+)
+def test_energy_at_the_speed_of_waves(cell, law, speed, contactors):
+    """A bar that is crushed at a wall does not gain energy, also while its cells collapse between their vertices, which ends the run."""
+    s = scene(COMM, cell, [box(cell, [0.0, 0.1], [2.0, 7.1], [2, 14])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, body = fem.Function(V), getattr(uem, law)(1.0, 0.3, "plane_strain")
+    foot = uem.Contact(s.tag("foot", 0, at(1, 0.1)), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
+    mass, scheme = uem.lumped_mass(V, 1.0), uem.CentralDifferences()
+    dynamics = uem.Dynamics(mass, velocity=(0.0, -speed), scheme=scheme, contactors=contactors)
+    problem = uem.UnitedProblem(body.residual(u, ufl.TestFunction(V)) * ufl.dx, u, contacts=[foot], dynamics=dynamics)
+    book, collapsed = uem.EnergyBook(problem, body.energy(u) * ufl.dx), False
+    try:
+        for step in uem.time_steps(problem, end=4.0):
+            book.write(step)
+    except uem.InvertedElementError:
+        collapsed = True
+    assert not collapsed or law != "LinearElastic"
+    defects = np.array([row.defect for row in book.rows]) / book.rows[0].kinetic
+    # central differences keep so much of the vibration within a step, of the row of cells at the wall
+    within = 0.5 * 0.5 / 14
+    assert -within < defects.min() and defects.max() < (3e-3 if law == "NeoHooke" else within)
 
 
 def test_yielded_bars_have_the_critical_step_of_unloading():

@@ -40,11 +40,11 @@ class StepControl:
         largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
         largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
         accurate: longest step that errors of the last ones in time let expect to be accurate.
-        due: number of the step after which explicit steps look at how fast edges of cells are stretched.
-        stretch: of these until then, since the critical step was found.
+        due: number of the step after which explicit steps look at how fast cells are strained.
+        stretch: their strain until then, since the critical step was found.
         resolved: bound on the length of explicit steps that resolve contacts on a stiff surface.
         of_contact: whether contacts change the critical step of explicit steps.
-        shortest: edge of a cell when explicit steps last looked at them, a length.
+        shortest: height of a cell when explicit steps last looked at them, a length.
     """
 
     def __init__(self, nominal: float = 1.0):
@@ -146,7 +146,7 @@ class StepControl:
             "stretch of cells": self.stretch,
             "resolved step": self.resolved,
             "steps of contact": self.of_contact,
-            "shortest edge": self.shortest,
+            "least height": self.shortest,
         }
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
@@ -154,7 +154,7 @@ class StepControl:
         # files of earlier versions lack these
         kept = {
             "largest speed": 0.0, "accurate step": np.inf, "critical step due": 0, "stretch of cells": np.inf, "resolved step": np.inf,
-            "shortest edge": np.inf,
+            "least height": np.inf,
         } | kept  # fmt: skip
         kept.setdefault("steps of contact", False)
         (

@@ -30,17 +30,17 @@ STIFF_SURFACE = 1.25
 #: most this part of the critical one with closed contacts, so that they resolve the bounce.
 #: [convention; critical step; test_explicit.py::test_a_thin_layer_at_the_wall]
 RESOLVED = 0.25
-#: How fast edges of cells are stretched is found anew after so many steps at most.
+#: How fast cells are strained is found anew after so many steps at most.
 #: [convention; steps; test_explicit_materials.py::test_cells_that_are_flattened]
 CHECKED_EVERY = 50
-#: The critical step is found anew before an edge is stretched by more than this part, and where a step does that.
+#: The critical step is found anew before a cell is strained by more than this, and where a step does that.
 #: [convention; strain; test_explicit_materials.py::test_cells_that_are_flattened]
 CHECKED_STRAIN = 0.1
-#: A step stretches no edge of a vibration by more than this part: stiffnesses that change within a step make or take energy.
+#: A step strains no cell of a vibration by more than this: stiffnesses that change within a step make or take energy.
 #: [convention; strain; test_explicit_materials.py::test_rubber_at_the_speed_of_its_waves]
 STEADY_STRAIN = 0.1
-#: A run ends where the shortest edge of all cells falls below this part of the mesh's shortest one: cells collapse, and steps with them.
-#: [bound; the shortest edge; -]
+#: A run ends where the least height of all cells falls below this part of the mesh's least one: cells collapse, and steps with them.
+#: [bound; the least height; -]
 COLLAPSED = 1e-3
 #: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from.
 #: [format; wave numbers; -]
@@ -75,20 +75,21 @@ class ExplicitStepper:
         self.limit = np.inf
         #: Part of the critical step that resolves closed contacts.
         self.part = 1.0
-        from scipy.sparse import csr_matrix
-
         config = problem.config
-        n_vertices, dofs = len(forms.reference_topology(compat.cell_name(config.mesh))[0]), compat.cell_dofs(config.V)
-        pairs = np.sort(dofs[:, np.array(np.triu_indices(n_vertices, 1))].transpose(0, 2, 1).reshape(-1, 2), axis=1)
-        edges = np.column_stack(np.divmod(np.unique(pairs @ [len(config.x), 1]), len(config.x)))
-        ends = np.arange(0, edges.size + 1, 2)
-        #: Differences of nodal values between the vertices of a cell ``(n, n_local)``.
-        self._edges = csr_matrix((np.tile([1.0, -1.0], len(edges)), edges.ravel(), ends), shape=(len(edges), len(config.x)))
-        #: Shortest distance of these vertices, and the fastest rate of stretching, as last looked at.
+        cell = compat.cell_name(config.mesh)
+        self._vertices = compat.cell_dofs(config.V)[:, : len(forms.reference_topology(cell)[0])]
+        # slopes are constant in simplices; other cells collapse first at the outermost points that forces are integrated at
+        degrees = [forms.DEGREES_ENOUGH, *(one.metadata().get("quadrature_degree", 0) for one in bodies.F.integrals())]
+        points, _ = forms.quadrature_rule(cell, 1 if cell in ("triangle", "tetrahedron") else max(degrees))
+        if cell in ("quadrilateral", "hexahedron"):
+            points = points[np.isin(points, (points.min(), points.max())).all(axis=1)]
+        #: Derivatives of the shape functions of vertices by reference coordinates ``(tdim, n_points, n_vertices)``.
+        self._derivatives = forms.create_lagrange_element(cell, 1).tabulate(1, points)[1:, :, :, 0]
+        #: Least height of the cells, and the fastest rate of strain, as last looked at.
         self.shortest, self.rate = np.inf, 0.0
-        self._of_mesh = self._lengths(config.X)
-        self._least = COLLAPSED * reduced(problem.comm, float(self._of_mesh.min(initial=np.inf)), op=MPI.MIN)
-        #: Whether accelerations may have stretched cells much in the last step.
+        self._of_mesh = self._slopes(config.X)
+        self._least = COLLAPSED * self._height(_inverse(self._of_mesh))
+        #: Whether accelerations may have strained cells much in the last step.
         self.sudden = False
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
 
@@ -188,9 +189,8 @@ class ExplicitStepper:
             largest = float(reduced(problem.comm, float(np.abs(a).max(initial=0.0)), op=MPI.MAX))
             self.sudden = 2.0 * largest * dt**2 > CHECKED_STRAIN * self.shortest
             if self.sudden:
-                length, start = self._lengths(config.x), self._lengths(config.X + config.of(problem.committed))
-                strain = float((np.abs(length - start) / start).max(initial=0.0))
-                changed = reduced(problem.comm, strain, op=MPI.MAX) > CHECKED_STRAIN
+                inverse = _inverse(self._slopes(config.x))
+                changed = self._strain(inverse, self._slopes(config.X + config.of(problem.committed))) > CHECKED_STRAIN
         if not changed and self.pattern() == before:
             return
         critical = self.critical_step()
@@ -237,59 +237,70 @@ class ExplicitStepper:
         control.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
         return condensed if stiff else fixed
 
-    def _differences(self, of: Array) -> Array:
-        """Differences of nodal values ``(n_local, gdim)`` along all edges ``(n, gdim)``."""
-        return np.asarray(self._edges @ of)
+    def _slopes(self, of: Array) -> Array:
+        """Derivatives of nodal values ``(n_local, gdim)`` by reference coordinates, at the points of cells ``(tdim, gdim, n)``."""
+        found = np.tensordot(self._derivatives, of.T[:, self._vertices], (2, 2)).transpose(0, 2, 1, 3)
+        return np.asarray(found.reshape(*found.shape[:2], -1))
 
-    def _lengths(self, of: Array) -> Array:
-        """Lengths of these differences ``(n,)``."""
-        along = self._differences(of)
-        return np.sqrt(np.einsum("ng,ng->n", along, along))
+    def _height(self, inverse: Array) -> float:
+        """Least height of the cells, from the inverse ``_slopes`` of positions (collective)."""
+        steepest = float(np.sqrt(np.square(inverse).sum(axis=0).max(initial=0.0)))
+        return 1.0 / float(reduced(self.problem.comm, steepest, op=MPI.MAX))
+
+    def _strain(self, inverse: Array, since: Array) -> float:
+        """Largest of Almansi's strains, from the inverse ``_slopes`` of positions and the earlier ``_slopes`` (collective)."""
+        back = np.einsum("itn,tjn->ijn", inverse, since)
+        E = 0.5 * (np.eye(len(back))[:, :, None] - np.einsum("ikn,jkn->ijn", back, back))
+        strain = float(np.sqrt(np.einsum("ijn,ijn->n", E, E).max(initial=0.0)))
+        return float(reduced(self.problem.comm, strain, op=MPI.MAX))
+
+    def _rates(self, of: Any, inverse: Array) -> Array:
+        """Rates of strain of a nodal field of rates, from the inverse ``_slopes`` of positions ``(n,)``."""
+        L = np.einsum("itn,tjn->ijn", inverse, self._slopes(of.x.array.reshape(-1, len(inverse))))
+        # turning does not strain
+        D = 0.5 * (L + L.transpose(1, 0, 2))
+        return np.sqrt(np.einsum("ijn,ijn->n", D, D))
 
     def look(self, stretch: float = np.inf) -> float:
-        """Find how fast the velocities stretch edges of cells, and the shortest edge (collective).
+        """Find how fast the velocities strain cells, and their least height (collective).
 
         Args:
-            stretch: of edges since the critical step was found, as far as known.
+            stretch: strain of cells since the critical step was found, as far as known.
 
         Returns:
-            This stretch, or that since the start if this is less than changes the critical step.
+            This strain, or that since the start if this is less than changes the critical step.
 
         Raises:
-            InvertedElementError: if this is a small part of the shortest one of the mesh.
+            InvertedElementError: if the height is a small part of the least one of the mesh.
         """
-        config = self.problem.config
-        v = self.dynamics.velocity.x.array.reshape(-1, config.gdim)
-        length = self._lengths(config.x)
-        found = self._lengths(v) / length, 1.0 / length, np.abs(length / self._of_mesh - 1.0)
-        self.rate, inverse, strain = reduced(self.problem.comm, np.array([of.max(initial=0.0) for of in found]), op=MPI.MAX)
-        self.shortest = 1.0 / inverse
+        inverse = _inverse(self._slopes(self.problem.config.x))
+        rate = float(self._rates(self.dynamics.velocity, inverse).max(initial=0.0))
+        self.rate = float(reduced(self.problem.comm, rate, op=MPI.MAX))
+        self.shortest, strain = self._height(inverse), self._strain(inverse, self._of_mesh)
         if self.shortest < self._least:
             raise InvertedElementError(
-                f"cells collapse: their shortest edge, {self._least / COLLAPSED:.3g} at the start, is {self.shortest:.3g}; "
+                f"cells collapse: their least height, {self._least / COLLAPSED:.3g} at the start, is {self.shortest:.3g}; "
                 "take a finer mesh, or lower speeds"
             )
-        return float(strain) if strain < CHECKED_STRAIN else stretch
+        return strain if strain < CHECKED_STRAIN else stretch
 
     def steps_to_look(self, dt: float, stretch: float) -> int:
-        """Number of steps of length ``dt`` until edges are stretched as far as they may, of which ``stretch`` is done; 0 for none."""
+        """Number of steps of length ``dt`` until cells are strained as far as they may, of which ``stretch`` is done; 0 for none."""
         strain = dt * self.rate
         left = max(CHECKED_STRAIN - stretch, 0.0)
         return int(min(left / strain, CHECKED_EVERY)) if strain > 0.0 else CHECKED_EVERY
 
     def steady_step(self, critical: float) -> float:
-        """Longest step in which no edge is stretched further than it may, so that stiffnesses hardly change (collective).
+        """Longest step in which no cell is strained further than it may, so that stiffnesses hardly change (collective).
 
-        An edge of the highest frequency, ``2 / critical``, vibrates with rates up to ``sqrt(v^2 + (a critical / 2)^2)``, in any phase.
+        A cell of the highest frequency, ``2 / critical``, vibrates with rates up to ``sqrt(v^2 + (a critical / 2)^2)``, in any phase.
         """
-        config, dynamics = self.problem.config, self.dynamics
+        dynamics = self.dynamics
         if self.problem.bodies.linear or not np.isfinite(critical):
             return np.inf
-        along = self._differences(config.x)
-        nodal = (of.x.array.reshape(-1, config.gdim) for of in (dynamics.velocity, dynamics.acceleration))
-        # turning does not stretch
-        v, a = ((self._differences(of) * along).sum(axis=1) for of in nodal)
-        rates = np.hypot(v, 0.5 * critical * a) / (along**2).sum(axis=1)
+        inverse = _inverse(self._slopes(self.problem.config.x))
+        v, a = (self._rates(of, inverse) for of in (dynamics.velocity, dynamics.acceleration))
+        rates = np.hypot(v, 0.5 * critical * a)
         fastest = float(reduced(self.problem.comm, float(rates.max(initial=0.0)), op=MPI.MAX))
         return STEADY_STRAIN / fastest if fastest > 0.0 else np.inf
 
@@ -313,3 +324,12 @@ class ExplicitStepper:
         dq, _ = solver.solve(-P.transpose(self._times_K(du)), 0.0)
         du.axpy(1.0, P.expand(solver.complete(dq)))
         return np.array(P.pass_on(self._times_K(du)).array_r) * self.moving
+
+
+def _inverse(A: Array) -> Array:
+    """Inverses of matrices ``(g, g, n)``, by cofactors: a library's loop over small matrices takes ten times as long."""
+    if len(A) == 2:
+        cofactors = np.stack([np.stack([A[1, 1], -A[1, 0]]), np.stack([-A[0, 1], A[0, 0]])])
+    else:
+        cofactors = np.stack([np.cross(A[i - 2], A[i - 1], axis=0) for i in range(3)])
+    return np.asarray(cofactors.transpose(1, 0, 2) / (A[0] * cofactors[0]).sum(axis=0))

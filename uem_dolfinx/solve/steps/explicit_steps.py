@@ -26,7 +26,7 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         end: time to reach.
 
     Raises:
-        InputError: if ``dt`` exceeds the critical step, or stretches cells too far.
+        InputError: if ``dt`` exceeds the critical step, or strains cells too far.
     """
     control, dynamics = problem.step_control, problem.dynamics
     kind: type[ExplicitStepper] = ExplicitStepper
@@ -90,7 +90,7 @@ def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:
             limit = (
                 f"critical step {critical:.4g} of central differences"
                 if dt > critical
-                else f"{steady:.4g} that hardly stretch cells"
+                else f"{steady:.4g} that hardly strain cells"
             )
             raise InputError(
                 f"dt = {dt:.6g} at time {dynamics.time:.6g}: expected no more than the {limit}; take shorter steps, or dt=None"
