@@ -143,6 +143,26 @@ def test_rubber_at_the_speed_of_its_waves(contactors):
 
 
 @pytest.mark.slow
+def test_the_memory_of_critical_steps():
+    """On several ranks, too, factors of critical steps go when others are made: 40 of them would fill 15 megabytes."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [300, 6])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u = fem.Function(V)
+    foot = uem.Contact(s.tag("foot", 0, at(1, 0.0)), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=(0.0, -0.01), scheme=uem.CentralDifferences())
+    F = uem.NeoHooke(1.0, 0.3, "plane_strain").residual(u, ufl.TestFunction(V)) * ufl.dx
+    stepper, most = ExplicitStepper(uem.UnitedProblem(F, u, contacts=[foot], dynamics=dynamics)), []
+    stepper.begin()
+    for n in (5, 40):
+        for _ in range(n):
+            # as of another state
+            stepper.system.solver._made_of = stepper.system.solver._read_for = None
+            stepper.critical_step()
+        most.append(getrusage(RUSAGE_SELF).ru_maxrss)
+    assert reduced(COMM, float(most[1] - most[0]), op=MPI.MAX) < 8e3
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("contactors", ["massy", "massless"])
 @pytest.mark.parametrize("speed", [0.5, 1.0, 1.2])
 @pytest.mark.parametrize(

@@ -156,6 +156,8 @@ class ExplicitStepper:
         With the largest eigenvalues k and c of stiffness and damping over mass it is ``2 / r`` of ``r^2 = k + r c``. Damping
         forces are those of the velocity in the middle of the step before.
         """
+        # matrices and factors of the last one
+        forms.free_petsc_garbage(self.problem.comm)
         # committed stresses are on the yield surface, from where the tangent is elastic, as it is in unloading
         self.problem.bodies.restore()
         with self.dynamics.without_inertia():
