@@ -56,7 +56,7 @@ class OverConstraints:
         whole, pairs = pairs, [one for pair in pairs for one in pair.members]
         surfaces, which = _surfaces(pairs)
         follows = [followed_nodes(config, dofs) for dofs in surfaces]
-        table: Bools = np.array(follows, dtype=np.bool_).reshape(-1, config.n_local)
+        table: Bools = np.array(follows, dtype=np.bool_).reshape(len(follows), config.n_local)
         meeting = [np.asarray(table[:, pair.nodes].any(axis=1))[which] for pair in pairs]
         meets: Bools = np.array(meeting, dtype=np.bool_).reshape(len(pairs), len(pairs))
         on = np.concatenate([np.zeros(0, dtype=bool), *(pair.discretisation.setting.on for pair in whole)])
