@@ -427,3 +427,8 @@ def gmsh_is_initialized(gmsh: Any) -> bool:
     if hasattr(gmsh, "isInitialized"):
         return bool(gmsh.isInitialized())
     return ctypes.c_void_p.in_dll(gmsh.lib, "_ZN6GModel4listE").value is not None
+
+
+def gmsh_takes_closest(gmsh: Any) -> bool:
+    """Whether fields of views take the closest value where a point has none, unless ``UseClosest`` is 0: 4.8 does not, 4.13 does."""
+    return bool((gmsh.GMSH_API_VERSION_MAJOR, gmsh.GMSH_API_VERSION_MINOR) >= (4, 13))

@@ -82,7 +82,9 @@ class MeshSizes:
             gmsh.view.addListData(views[-1], "ST" if k == 3 else "SS", len(x), data.ravel().tolist())
             fields.append(field.add("PostView"))
             field.setNumber(fields[-1], "ViewTag", views[-1])
-        # Gmsh 4.8 finds any of the simplices that hold a point, and a huge size without one: copies count outside the bodies alone
+            if compat.gmsh_takes_closest(gmsh):
+                field.setNumber(fields[-1], "UseClosest", 0)
+        # Gmsh finds any of the simplices that hold a point, and a huge size without one: copies count outside the bodies alone
         both, none = field.add("MathEval"), 2 * values.max()
         body, copies = (f"F{tag}" for tag in fields)
         field.setString(both, "F", f"{body} * step({none} - {body}) + {copies} * step({body} - {none})")
