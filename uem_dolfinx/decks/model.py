@@ -270,10 +270,10 @@ class _Reader:
     def _dload(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         self._begins("DLOAD", options, self._step.pressures, self._step.bodies)
         of_bodies = [row for row in rows if row[1].upper() in ("GRAV", "CENTRIF")]
-        for who, label, value, *numbers in of_bodies:
-            if who.isdigit():
-                self._deck.elsets.setdefault(f"ELEMENT {who}", (f"element {who}", [int(who)]))
-            where = f"element {who}" if who.isdigit() else who, BodyLoad.of(label.upper(), _numbers(numbers))
+        for elements, label, value, *numbers in of_bodies:
+            if elements.isdigit():
+                self._deck.elsets.setdefault(f"ELEMENT {elements}", (f"element {elements}", [int(elements)]))
+            where = f"element {elements}" if elements.isdigit() else elements, BodyLoad.of(label.upper(), _numbers(numbers))
             self._add("DLOAD", self._step.bodies, where, self._value(value, options))
         pressing = [row for row in rows if re.fullmatch(r"P\d?", row[1].upper())]
         for who, label, value in (row[:3] for row in pressing):

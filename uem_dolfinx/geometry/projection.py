@@ -221,12 +221,17 @@ class FacetProjection:
         return (behind & ~self.beyond.any(axis=1)).nonzero()[0]
 
     @cached_property
+    def from_middle(self) -> Array:
+        """Ways from the middles of facets to the closest points ``(n, gdim)``."""
+        return self.foot - self.x.mean(axis=1)
+
+    @cached_property
     def behind_bends(self) -> Array:
         """How far past an end points may be inside a concave target and still be behind a bend that reaches this end, a length ``(n,)``."""
         own = unit_normals(Tabulated(self.weights, self.dN, self.ddN), self.x)
         lean = np.einsum("ng,ng->n", own, self.averaged)
         slope = np.linalg.norm(self.averaged - lean[:, None] * own, axis=1)
-        concave = np.einsum("ng,ng->n", self.averaged, self.foot - self.x.mean(axis=1)) < 0.0
+        concave = np.einsum("ng,ng->n", self.averaged, self.from_middle) < 0.0
         return np.where(concave, BEHIND_BENDS * slope * np.maximum(-self.height, 0.0), 0.0)
 
     def take(self, which: Ints) -> FacetProjection:

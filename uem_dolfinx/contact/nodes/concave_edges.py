@@ -171,8 +171,7 @@ class ConcaveEdges:
         """Contactors of ``which (n,)`` whose closest points are at a concave side or vertex of their facets ``(k,)``."""
         i = np.flatnonzero(which)
         i = i[(self.target.shape.side_distances(nearest.xi[i]) < ON_SIDE).any(axis=1)]
-        out = nearest.foot[i] - nearest.x[i].mean(axis=1)
-        return i[np.einsum("kg,kg->k", nearest.averaged[i], out) < -ON_PLANE * nearest.facet_size[i]]
+        return i[np.einsum("kg,kg->k", nearest.averaged[i], nearest.from_middle[i]) < -ON_PLANE * nearest.facet_size[i]]
 
     def _between(self, nearest: FacetProjection, points: Array, state: PairState, which: Ints) -> tuple[Ints, Ints]:
         """Contactors of ``which (k,)`` that are as deep in a further facet as in their own, with this facet in ``held`` (collective).
@@ -180,9 +179,8 @@ class ConcaveEdges:
         With one of the two normals, which would be arbitrary, a frictionless force would lean to one side; friction holds the contactor.
         """
         none = np.full((len(which), self.config.gdim - 1), -1)
-        out = nearest.foot[which] - nearest.x[which].mean(axis=1)
-        none[:, 0] = beside = self.target.project(nearest.foot[which] + ACROSS * out, which).facet
-        ask = np.flatnonzero((beside >= 0) & (beside != state.facet[which]))
+        none[:, 0] = across = self.target.project(nearest.foot[which] + ACROSS * nearest.from_middle[which], which).facet
+        ask = np.flatnonzero((across >= 0) & (across != state.facet[which]))
         c = self._corners_of(state, points, which[ask], none[ask])
         if c is None:
             return which[:0], none[:0]
