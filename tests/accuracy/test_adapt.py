@@ -5,6 +5,8 @@ Read first: ``test_a_sharp_corner``.
 
 from __future__ import annotations
 
+import logging
+
 from mpi4py import MPI
 
 import numpy as np
@@ -75,6 +77,27 @@ def test_a_contact_narrower_than_the_cells():
     # by less than 15 % with Gmsh 4.8, by 25 % with 4.15
     assert found.meshes[1].estimate > 0.7 * found.meshes[0].estimate
     assert found.reached and found.estimate.relative > 0.5 * 0.02 and found.meshes[-1].cells < 3 * found.meshes[0].cells
+
+
+def test_few_facets_in_contact(caplog):
+    """One node touches, and the estimate is a fifth of the error, in statics at prescribed displacements a difference of energies."""
+    adapted, problem, limit = uem.adapt(pressed, tolerance=0.01), pressed(None), uem.ErrorLimit(0.3)
+    fine = adapted.estimate.norm
+    list(uem.load_steps(problem, 1, estimate=limit))
+    with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
+        found = uem.error_estimate(problem)
+    error = np.sqrt(1.0 - (fine / found.norm) ** 2)
+    assert found.relative < 0.3 < 0.6 * error < found.at_most < 1.5 * error and limit.exceeded
+    assert COMM.bcast("facets are in contact, expected 2" in caplog.text)
+    assert not adapted.estimate.narrow and adapted.estimate.at_most == adapted.estimate.relative
+
+
+def test_a_large_tolerance():
+    """The estimate of the first mesh, 12 %, where the force errs by half, does not satisfy a tolerance of 20 %: its contact is narrow."""
+    found, fine = (uem.adapt(pressed, tolerance=tolerance) for tolerance in (0.2, 0.01))
+    force, exact = (one.problem.contacts[0].resultant().force[1] for one in (found, fine))
+    assert found.reached and found.meshes[0].estimate < 0.2 < found.meshes[0].at_most and found.meshes[-1].at_most < 0.2
+    assert abs(force / exact - 1) < 0.05 and found.meshes[-1].cells < 2 * found.meshes[0].cells
 
 
 @pytest.mark.parametrize("quads, h, tolerance", [(0, 0.1, 0.035), slow(1, 0.2, 0.03)])

@@ -13,7 +13,8 @@ import numpy as np
 import ufl
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+from uem_dolfinx.accuracy.estimate import FEWEST, UNRESOLVED, ErrorEstimate, estimated
+from uem_dolfinx.accuracy.few_facets import narrow_contacts
 from uem_dolfinx.accuracy.first_guess import carry_over, refuse_first_guess
 from uem_dolfinx.accuracy.goal import GoalError, goal_error
 from uem_dolfinx.arrays import Array
@@ -53,6 +54,7 @@ class AdaptedMesh:
         parts: of a goal, the sum of the cells' parts over the value, which cannot cancel; else the same as ``estimate``.
         iterations: of Newton, in all steps; 0 if ``solve`` returns none.
         seconds: for the mesh, the solution and the estimate.
+        narrow: whether a contact has fewer than ``FEWEST`` facets along a direction.
     """
 
     cells: int
@@ -61,11 +63,17 @@ class AdaptedMesh:
     parts: float
     iterations: int
     seconds: float
+    narrow: bool = False
 
     @property
     def known(self) -> float:
-        """What a tolerance bounds: the estimate, or more where it is small because its parts cancel."""
+        """The estimate, or more where it is small because its parts cancel."""
         return max(self.estimate, self.parts / MOST_CANCELLED)
+
+    @property
+    def at_most(self) -> float:
+        """What a tolerance bounds: ``known``, or ``UNRESOLVED`` times as much where a contact is narrower than a few facets."""
+        return self.known * (UNRESOLVED if self.narrow else 1.0)
 
 
 @dataclass(frozen=True)
@@ -157,7 +165,7 @@ def adapt(
     while True:
         start = perf_counter()
         problem, steps = _solved(make, size, solve, problem, solve_again)
-        estimate = error_estimate(problem) if goal is None else goal_error(problem, goal(problem))
+        estimate = estimated(problem) if goal is None else goal_error(problem, goal(problem))
         if np.isnan(estimate.relative):
             raise InputError(
                 f"adapt: the {'displacement' if goal is None else 'goal'} is zero on mesh {len(found) + 1}, to rounding, and its error is "
@@ -178,8 +186,9 @@ def adapt(
         if tolerance is not None:
             # sizes that Gmsh keeps less well, or errors that fall more slowly: aim lower
             if len(found) > 1 and found[-1].known > (1 - SAME_NUMBER) * found[-2].known:
-                aim *= max(tolerance / found[-1].known, AIM**2)
-            wanted = reduced(mesh.comm, float(estimate.shares.sum())) * (aim * tolerance / found[-1].known) ** power
+                aim *= max(tolerance / found[-1].at_most, AIM**2)
+            most = min(tolerance, found[-1].known)
+            wanted = reduced(mesh.comm, float(estimate.shares.sum())) * (aim * most / found[-1].known) ** power
         if size is not None:
             scale *= float(np.clip(found[-1].cells / expected, 0.5, 2.0)) ** (1.0 / mesh.topology.dim)
             scale = scale if tolerance is None else min(scale, 1.0)
@@ -199,7 +208,7 @@ def enough(found: list[AdaptedMesh], tolerance: float | None, cells: int | None)
     """Whether the last mesh has what was wanted."""
     last = found[-1]
     if tolerance is not None:
-        return last.known <= tolerance
+        return last.at_most <= tolerance
     assert cells is not None
     if abs(last.cells / cells - 1) > SAME_NUMBER or len(found) < 2:
         return False
@@ -274,4 +283,12 @@ def _measured(problem: UnitedProblem, estimate: ErrorEstimate | GoalError, steps
         iterations += sum(getattr(step, "newton_iterations", 0) for step in steps)
     unknowns = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
     parts = estimate.parts / abs(estimate.value) if isinstance(estimate, GoalError) else estimate.relative
-    return AdaptedMesh(int(cells), int(unknowns), estimate.relative, parts, iterations, perf_counter() - start)
+    return AdaptedMesh(
+        int(cells),
+        int(unknowns),
+        estimate.relative,
+        parts,
+        iterations,
+        perf_counter() - start,
+        bool(narrow_contacts(problem, FEWEST)),
+    )

@@ -19,20 +19,17 @@ import numpy as np
 from uem_dolfinx import forms
 from uem_dolfinx.accuracy.enriched import Enriched
 from uem_dolfinx.accuracy.enriched_curvature import Side, curvature
+from uem_dolfinx.accuracy.few_facets import of_facets
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets, unit
 from uem_dolfinx.geometry.shapes import area_vectors, facet_shape
-from uem_dolfinx.log import logger
-from uem_dolfinx.parallel import gathered, reduced
+from uem_dolfinx.parallel import gathered
 
 #: Pieces of a rule along each side of a contactor facet, on which kinks of the target lie anywhere.
 #: [bound; pieces; test_goal.py::test_effectivity]
 PIECES = 4
-#: With fewer facets in contact along each direction of the surface, the solution of one degree more has another contact.
-#: [convention; facets; test_goal.py::test_few_facets_in_contact]
-FEW = 3
 
 
 class EnrichedRows(NamedTuple):
@@ -74,7 +71,6 @@ def enriched_rows(enriched: Enriched) -> EnrichedRows:
     first = np.append(0, np.cumsum(gathered(comm, sum(len(one.nodes) * one.width for one in surfaces))))
     at = int(first[comm.rank])
     for one in surfaces:
-        one.warn_of_few()
         count = len(one.nodes) * one.width
         parts.append(one.entries(at))
         states.append((np.repeat(one.active, one.width), np.repeat(one.tied, one.width)))
@@ -119,14 +115,10 @@ class _Surface:
             state[pair.nodes, 1] = (friction.active(whole.trial) & ~slips)[rows]
             state[pair.nodes, 2] = slips[rows]
             state[pair.nodes, 3:] = (friction.value[:, None] * friction.directions(whole.trial))[rows]
-        of_facets = self._of_nodes(state)
-        whole = of_facets[:, :, :2].min(axis=1, initial=1.0)
-        active = of_facets[:, :, 0] > 0
-        #: Numbers of all facets with an active contactor, and of those whose contactors are all active.
-        self.touched, self.closed = reduced(config.comm, np.array([active.any(axis=1).sum(), active.all(axis=1).sum()]))
-        self.count = reduced(config.comm, len(whole))
+        at_nodes = of_facets(config, contact, state)
+        whole = at_nodes[:, :, :2].min(axis=1, initial=1.0)
         #: Of each facet, a mean of mu s over the contactors that slip ``(m, gdim)``.
-        self.rubbing = of_facets[:, :, 3:].sum(axis=1) / np.maximum(of_facets[:, :, 2].sum(axis=1), 1.0)[:, None]
+        self.rubbing = at_nodes[:, :, 3:].sum(axis=1) / np.maximum(at_nodes[:, :, 2].sum(axis=1), 1.0)[:, None]
         there, active, tied = (
             nodes.to_owners(self.dofs.ravel(), np.repeat(v, self.dofs.shape[1]))[: nodes.n_owned] > 0
             for v in (np.ones(len(whole)), *whole.T)
@@ -135,28 +127,11 @@ class _Surface:
         self.active: Bools = active[self.nodes]
         self.tied: Bools = tied[self.nodes]
 
-    def warn_of_few(self) -> None:
-        """Warn if contact begins and ends within a few facets; where all of them are in contact, or tied, its ends are known."""
-        few = FEW ** (self.enriched.problem.config.tdim - 1)
-        if self.closed < few and self.touched and self.closed < self.count:
-            logger.warning(
-                "contact '%s': %d facets are in contact, expected %d at least: the goal's estimate may be off by a factor of five, "
-                "or have the wrong sign; refine the contactor there",
-                self.contact.name, self.closed, few,
-            )  # fmt: skip
-
     def _dofs(self, tag: Any) -> Indices:
         """Local nodes of the enriched space on this rank's facets ``(m, nn)``."""
         config, of = self.enriched.problem.config, self.enriched
         space: Any = SimpleNamespace(V=of.W, mesh=config.mesh, tdim=config.tdim, degree=of.degree)
         return nodes_of_facets(space, tag).dofs
-
-    def _of_nodes(self, values: Array) -> Array:
-        """Values at the displacement's owned nodes ``(n_owned, k)``, at those of the facets ``(m, nn, k)`` (collective)."""
-        config, dofs = self.enriched.problem.config, self.facets.dofs
-        return np.asarray(
-            config.from_owners(np.arange(config.n_owned), values, dofs.ravel()).reshape(*dofs.shape, values.shape[1])
-        )
 
     def entries(self, first: int) -> list[Any]:
         """Entries of the equations, which on this rank begin with the number ``first`` (collective)."""
@@ -193,7 +168,7 @@ class _Surface:
         if (offset := contact.pair.discretisation.setting.offset) is not None:
             of_nodes = np.zeros((config.n_owned, 1))
             of_nodes[contact.pair.nodes, 0] = offset
-            gap = gap - (self._of_nodes(of_nodes)[:, :, 0] @ N.T).ravel()
+            gap = gap - (of_facets(config, contact, of_nodes)[:, :, 0] @ N.T).ravel()
         # which facet and point of the rule
         facet, point = np.divmod(np.arange(len(facets.dofs) * n_q), n_q)
         # those of each test function's node: the normal, or all components of tied ones (points, test, direction, component)

@@ -9,12 +9,20 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.accuracy.enriched import Enriched
+from uem_dolfinx.accuracy.few_facets import FewFacets, narrow_contacts, warn_of_few_facets
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.bodies import bodies_in_order, body_sums
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
+
+#: With fewer facets in contact along each direction of the surface, estimates see less than half of the error.
+#: [convention; facets; test_adapt.py::test_a_large_tolerance]
+FEWEST = 2
+#: Where fewer are, the error is at most so many times the estimate.
+#: [convention; estimate; test_adapt.py::test_few_facets_in_contact]
+UNRESOLVED = 5.0
 
 
 @dataclass(frozen=True)
@@ -27,6 +35,7 @@ class ErrorEstimate:
         of_bodies: estimate of each body ``(n_bodies,)``, in the order in which their cells come in the mesh's input.
         cells: estimate of each cell, a Function that is constant in cells, for files and pictures.
         shares: squared estimates of this rank's cells ``(n_owned_cells,)``.
+        narrow: contacts of fewer than ``FEWEST`` facets along each direction: wider cells see a part of the error alone.
     """
 
     total: float
@@ -34,11 +43,17 @@ class ErrorEstimate:
     of_bodies: Array
     cells: fem.Function = field(repr=False)
     shares: Array = field(repr=False)
+    narrow: list[FewFacets] = field(default_factory=list, repr=False)
 
     @property
     def relative(self) -> float:
         """Estimate over the norm of the displacement; NaN without displacement."""
         return self.total / self.norm if self.norm else float("nan")
+
+    @property
+    def at_most(self) -> float:
+        """What a tolerance bounds: ``relative``, or ``UNRESOLVED`` times as much where few facets are in contact."""
+        return self.relative * (UNRESOLVED if self.narrow else 1.0)
 
     def __str__(self) -> str:
         """The estimate in per cent."""
@@ -50,7 +65,8 @@ def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
 
     The residual of the solution is evaluated in a space of one degree more, with the contact tractions on both sides; see
     ``accuracy.enriched``. Any law, with history too, large strain and sliding, friction, and both couplings are included. The
-    estimate is of the last step alone; errors of earlier steps in a history, and of steps of time, are not included.
+    estimate is of the last step alone; errors of earlier steps in a history, and of steps of time, are not included. It warns where
+    fewer than ``FEWEST`` facets are in contact along a direction: the error may then be ``UNRESOLVED`` times as large.
 
     Args:
         problem: in statics, in equilibrium, as ``solve`` or a step leaves it.
@@ -69,6 +85,13 @@ def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
             print(estimate)
             uem.plot_scene(problem, field=estimate.cells)
     """
+    estimate = estimated(problem)
+    warn_of_few_facets(estimate.narrow, f"the error may be {UNRESOLVED:g} times the estimate")
+    return estimate
+
+
+def estimated(problem: UnitedProblem) -> ErrorEstimate:
+    """As ``error_estimate``, without its warning (collective)."""
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
         refuse_estimate(problem)
@@ -82,7 +105,8 @@ def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
         cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="error_estimate")
         cells.x.array[: len(squared)] = np.sqrt(squared)
         cells.x.scatter_forward()
-    return ErrorEstimate(float(np.sqrt(sums.sum())), float(np.sqrt(enriched.energy)), np.sqrt(sums), cells, squared)
+    total, norm = float(np.sqrt(sums.sum())), float(np.sqrt(enriched.energy))
+    return ErrorEstimate(total, norm, np.sqrt(sums), cells, squared, narrow_contacts(problem, FEWEST))
 
 
 def refuse_estimate(problem: UnitedProblem) -> None:

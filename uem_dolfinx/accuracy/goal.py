@@ -26,6 +26,7 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.accuracy.enriched import Enriched
 from uem_dolfinx.accuracy.enriched_rows import EnrichedRows, enriched_rows
 from uem_dolfinx.accuracy.estimate import refuse_estimate
+from uem_dolfinx.accuracy.few_facets import narrow_contacts, warn_of_few_facets
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
@@ -38,6 +39,9 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import Exchange, agreed, gathered, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
+#: With fewer facets in contact along each direction of the surface, the solution of one degree more has another contact.
+#: [convention; facets; test_goal.py::test_few_facets_in_contact]
+FEW = 3
 #: Changes of the active set in the linear problem of a goal's error.
 #: [bound; factorisations; -]
 MOST_SETS = 10
@@ -100,6 +104,9 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
     """
     check_goal(problem, J)
     config, whole = problem.config, revolved(J)
+    warn_of_few_facets(
+        narrow_contacts(problem, FEW), "the goal's estimate may be off by a factor of five, or have the wrong sign"
+    )
     with timed("estimate errors"):
         enriched = Enriched(problem)
         value = forms.assemble_scalar(forms.form(whole), config.comm)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+from uem_dolfinx.accuracy.estimate import UNRESOLVED, ErrorEstimate, estimated
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -24,6 +24,7 @@ class ErrorLimit:
 
     Attributes:
         found: estimated error of every step so far; NaN without displacement, and while a step releases forces.
+        exceeded: whether the last one exceeds the bound; where few facets are in contact, ``UNRESOLVED`` times the estimate.
 
     Raises:
         InputError, InputTypeError: for bounds that are not between 0 and 1; and in steps for problems that ``error_estimate`` refuses.
@@ -38,6 +39,7 @@ class ErrorLimit:
 
     bound: float
     found: list[float] = field(default_factory=list, init=False)
+    exceeded: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self.bound = given.number("bound", self.bound, given.between(0.0, 1.0))
@@ -47,18 +49,17 @@ class ErrorLimit:
         if problem.bodies.dead is not None:
             self.found.append(float("nan"))
             return
-        estimate = error_estimate(problem)
-        below = not self.found or not self.found[-1] > self.bound
+        estimate = estimated(problem)
         self.found.append(estimate.relative)
-        if below and estimate.relative > self.bound:
+        below, self.exceeded = not self.exceeded, estimate.at_most > self.bound
+        if below and self.exceeded:
             x = ", ".join(f"{c:.4g}" for c in _worst(problem, estimate))
+            few = f", and may be {UNRESOLVED:g} times as large, since few facets are in contact" if estimate.narrow else ""
             logger.warning(
-                "the estimated error by the mesh is %.3g %% of the displacement in the energy norm, above %.3g %%, most of it in a cell "
-                "at (%s): refine the mesh there, or let adapt do so",
-                100 * estimate.relative,
-                100 * self.bound,
-                x,
-            )
+                "the estimated error by the mesh is %.3g %% of the displacement in the energy norm%s; the bound is %.3g %%, and most of it "
+                "is in a cell at (%s): refine the mesh there, or let adapt do so",
+                100 * estimate.relative, few, 100 * self.bound, x,
+            )  # fmt: skip
 
 
 def _worst(problem: UnitedProblem, estimate: ErrorEstimate) -> np.ndarray:
