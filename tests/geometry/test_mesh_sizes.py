@@ -109,3 +109,43 @@ def test_subdivided_cells_have_their_sizes(dim, tmp_path):
     own = cell_sizes(finer)
     mean = COMM.allreduce(own.sum()) / COMM.allreduce(len(own))
     assert finer.topology.dim == dim and 0.8 < mean / size < 1.2
+
+
+#: Dimension and Gmsh's commands for two bodies.
+TOUCHING = {
+    "blocks": (2, "Rectangle(1) = {0, 0, 0, 1, 1}; Rectangle(2) = {0, 1, 0, 1, 1};"),
+    "quadrilaterals": (2, "Rectangle(1) = {0, 0, 0, 1, 1}; Rectangle(2) = {0, 1, 0, 1, 1}; Mesh.SubdivisionAlgorithm = 1;"),
+    "ring": (
+        2,
+        "Disk(1) = {0, 0, 0, 1}; Disk(2) = {0, 0, 0, 1.6}; Disk(3) = {0, 0, 0, 1};\n"
+        "BooleanDifference{ Surface{2}; Delete; }{ Surface{3}; Delete; }",
+    ),
+    "plates": (2, "Rectangle(1) = {0, 0, 0, 1, 0.1}; Rectangle(2) = {0, 0.1, 0, 1, 0.1};"),
+    "boxes": (3, "Box(1) = {0, 0, 0, 1, 1, 1}; Box(2) = {0.2, 0.2, 1, 1, 1, 1};"),
+}
+
+
+@pytest.mark.parametrize("scene", ["blocks", *(slow(name) for name in TOUCHING if name != "blocks")])
+def test_sizes_where_bodies_touch(scene, tmp_path):
+    """Along their common surface each of two bodies has its own sizes, though points of the two are the same."""
+    dim, text = TOUCHING[scene]
+    path = COMM.bcast(tmp_path) / "touching.geo"
+    if COMM.rank == 0:
+        physical = "".join(
+            f'Physical {("Surface", "Volume")[dim - 2]}("{name}") = {{{tag}}};\n' for tag, name in ((1, "one"), (2, "two"))
+        )
+        path.write_text(f'SetFactory("OpenCASCADE");\n{text}\nMesh.MeshSizeMax = 0.3;\n{physical}')
+    COMM.barrier()
+    mesh, tags = uem.read_gmsh(path, COMM, gdim=dim)
+    for wanted in ((0.05, 0.2), (0.2, 0.05)):
+        sizes = np.zeros(len(cell_sizes(mesh)))
+        for name, size in zip(("one", "two"), wanted):
+            owned = tags[name].entities
+            sizes[owned[owned < len(sizes)]] = size
+        finer, of_finer = uem.read_gmsh(path, COMM, gdim=dim, size=MeshSizes(mesh, sizes))
+        found = cell_sizes(finer)
+        for name, size in zip(("one", "two"), wanted):
+            owned = of_finer[name].entities
+            part = found[owned[owned < len(found)]] / size
+            least, most = COMM.allreduce(part.min(initial=np.inf), MPI.MIN), COMM.allreduce(part.max(initial=0.0), MPI.MAX)
+            assert least > 0.5 and most < 1.8

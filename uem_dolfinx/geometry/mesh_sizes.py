@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 
 #: Simplices that fill a cell, by its vertices in DOLFINx's order.
 FILLED_BY = {
@@ -47,6 +47,7 @@ class MeshSizes:
         cell: name of the earlier mesh's cells.
         points: their vertices on rank 0 ``(m, n_vertices, gdim)``; empty on other ranks.
         values: sizes there ``(m, n_vertices)``.
+        body: number of the body of each cell ``(m,)``: cells with common vertices.
     """
 
     def __init__(self, mesh: Any, sizes: Array):
@@ -60,34 +61,35 @@ class MeshSizes:
             np.concatenate(parts) if parts else part[:0] for parts, part in zip(found, (number, x, sizes))
         )
         self.values: Array = np.zeros((0, n_vertices))
+        self.body: Ints = np.zeros(0, np.int64)
         if mesh.comm.rank == 0:
+            from scipy.sparse import coo_matrix
+            from scipy.sparse.csgraph import connected_components
+
             # the same order and the same digits on any ranks, since Gmsh makes other meshes of sizes that differ by rounding
             order = np.lexsort(self.points.reshape(len(sizes), -1).T)
             numbers, self.points, sizes = numbers[order], self.points[order], sizes[order]
-            self.values = np.exp(np.round(np.log(graded(*_unique(numbers), self.points, sizes)), DIGITS))
+            vertices, count = _unique(numbers)
+            self.values = np.exp(np.round(np.log(graded(vertices, count, self.points, sizes)), DIGITS))
+            edges = vertices[:, [0] * (n_vertices - 1)].ravel(), vertices[:, 1:].ravel()
+            of_vertices = connected_components(coo_matrix((np.ones(len(edges[0])), edges), shape=(count, count)))[1]
+            self.body = of_vertices[vertices[:, 0]].astype(np.int64)
 
     @contextmanager
     def within(self, gmsh: Any) -> Iterator[None]:
         """Mesh with these sizes, on rank 0."""
         before = {name: gmsh.option.getNumber(name) for name in OTHERS}
-        corners, field = np.array(FILLED_BY[self.cell]), gmsh.model.mesh.field
-        gdim, k = self.points.shape[2], corners.shape[1]
-        points, values = self.points[:, corners].reshape(-1, k, gdim), self.values[:, corners].reshape(-1, k)
-        views, fields = [], []
-        for x, at in ((points, values), _beyond(points, values)):
-            lists = np.zeros((len(x), 3, k))
-            lists[:, :gdim] = x.transpose(0, 2, 1)
-            views.append(gmsh.view.add("sizes"))
-            data = np.concatenate([lists.reshape(len(x), -1), at], axis=1)
-            gmsh.view.addListData(views[-1], "ST" if k == 3 else "SS", len(x), data.ravel().tolist())
-            fields.append(field.add("PostView"))
-            field.setNumber(fields[-1], "ViewTag", views[-1])
-            if compat.gmsh_takes_closest(gmsh):
-                field.setNumber(fields[-1], "UseClosest", 0)
-        # Gmsh finds any of the simplices that hold a point, and a huge size without one: copies count outside the bodies alone
-        both, none = field.add("MathEval"), 2 * values.max()
-        body, copies = (f"F{tag}" for tag in fields)
-        field.setString(both, "F", f"{body} * step({none} - {body}) + {copies} * step({body} - {none})")
+        field, fields = gmsh.model.mesh.field, []
+        views: list[int] = []
+        for b, entities in enumerate(self._entities(gmsh) if self.body.any() else [[]]):
+            of_body = self._of_body(gmsh, self.body == b, views)
+            fields.append(field.add("Restrict") if entities else of_body)
+            if entities:
+                field.setNumber(fields[-1], "InField", of_body)
+            for name, tags in zip(("CurvesList", "SurfacesList", "VolumesList"), entities):
+                field.setNumbers(fields[-1], name, tags)
+        both = field.add("Min")
+        field.setNumbers(both, "FieldsList", fields)
         field.setAsBackgroundMesh(both)
         try:
             for name, value in OTHERS.items():
@@ -100,6 +102,55 @@ class MeshSizes:
                 gmsh.option.setNumber(name, value)
             for view in views:
                 gmsh.view.remove(view)
+
+    def _of_body(self, gmsh: Any, here: Bools, views: list[int]) -> int:
+        """A field of Gmsh with the sizes of a body's cells; ``views`` are those that it made so far."""
+        corners, field = np.array(FILLED_BY[self.cell]), gmsh.model.mesh.field
+        gdim, k = self.points.shape[2], corners.shape[1]
+        points, values = self.points[here][:, corners].reshape(-1, k, gdim), self.values[here][:, corners].reshape(-1, k)
+        fields = []
+        for x, at in ((points, values), _beyond(points, values)):
+            lists = np.zeros((len(x), 3, k))
+            lists[:, :gdim] = x.transpose(0, 2, 1)
+            views.append(gmsh.view.add("sizes"))
+            data = np.concatenate([lists.reshape(len(x), -1), at], axis=1)
+            gmsh.view.addListData(views[-1], "ST" if k == 3 else "SS", len(x), data.ravel().tolist())
+            fields.append(field.add("PostView"))
+            field.setNumber(fields[-1], "ViewTag", views[-1])
+            if compat.gmsh_takes_closest(gmsh):
+                field.setNumber(fields[-1], "UseClosest", 0)
+        # Gmsh finds any of the simplices that hold a point, and a huge size without one: copies count outside the body alone
+        both, none = field.add("MathEval"), 2 * values.max()
+        body, copies = (f"F{tag}" for tag in fields)
+        field.setString(both, "F", f"{body} * step({none} - {body}) + {copies} * step({body} - {none})")
+        return int(both)
+
+    def _entities(self, gmsh: Any) -> list[list[list[int]]]:
+        """Curves, surfaces and volumes of Gmsh's geometry in each body: where they touch, these differ though points are the same.
+
+        A surface in the plane, or a volume, belongs to the body whose cells are nearest to most cells that Gmsh gives it by itself.
+        """
+        from scipy.spatial import cKDTree
+
+        dim = len(FILLED_BY[self.cell][0]) - 1
+        found: list[list[list[int]]] = [[[], [], []] for _ in range(self.body.max() + 1)]
+        left = {d: {tag for _, tag in gmsh.model.getEntities(d)} for d in (1, 2, 3)}
+        middles = cKDTree(self.points.mean(axis=1))
+        gmsh.model.mesh.generate(dim)
+        for entity in gmsh.model.getEntities(dim):
+            parts = [
+                gmsh.model.mesh.getBarycenters(kind, entity[1], False, True) for kind in gmsh.model.mesh.getElementTypes(*entity)
+            ]
+            points = np.concatenate([*parts, np.zeros(0)]).reshape(-1, 3)[:, : self.points.shape[2]]
+            nearest = int(np.bincount(self.body[middles.query(points)[1]], minlength=1).argmax())
+            surfaces = [entity] if dim == 2 else gmsh.model.getBoundary([entity], oriented=False)
+            curves = gmsh.model.getBoundary(surfaces, combined=False, oriented=False)
+            for d, tag in {entity, *surfaces, *curves}:
+                found[nearest][d - 1].append(tag)
+                left[d].discard(tag)
+        gmsh.model.mesh.clear()
+        # curves within a surface, and others that bound nothing
+        return [[[*tags, *left[d]] for d, tags in enumerate(of_body, start=1)] for of_body in found]
 
 
 def _beyond(points: Array, values: Array) -> tuple[Array, Array]:
