@@ -59,9 +59,9 @@ for degree in (1, 2):
         problem.solve()
         uniform[degree].append((len(problem.u.x.array), uem.error_estimate(problem)))
     for k in range(args.tolerances):
-        found = uem.adapt(lambda size, degree=degree: punch(degree, size), tolerance=(0.1, 0.05)[degree - 1] / 2**k)
+        found = uem.adapt(lambda size, degree=degree: punch(degree, size), tolerance=(0.14, 0.07)[degree - 1] / 2**k)
         adapted[degree].append((found.meshes[-1].unknowns, found.estimate))
-finest = uem.adapt(lambda size: punch(2, size), tolerance=0.02 / 2**args.tolerances)
+finest = uem.adapt(lambda size: punch(2, size), tolerance=0.03 / 2**args.tolerances)
 exact = uem.error_estimate(finest.problem).norm ** 2
 
 # %% [markdown]

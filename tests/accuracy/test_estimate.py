@@ -55,6 +55,23 @@ def test_five_meshes(degree, finer, coupling):
     assert min(ratios) > 0.75 and max(ratios) < 1.1 * min(ratios) < 1.0
 
 
+@pytest.mark.parametrize("led", ["displacement", "force", "both"])
+def test_norm(led):
+    """The norm of the displacement is the root of its work, ``u' K u``, however the body is loaded."""
+    mesh, tags = uem.read_gmsh(uem.example_mesh("adapt_punch"), COMM, gdim=2, parameters={"h": 0.5})
+    V = uem.function_space(mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    work = uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    bcs = [uem.dirichlet(V, tags["symmetry"], 0), uem.dirichlet(V, tags["bottom"], 1, 0.0 if led == "force" else 0.01)]
+    F = work - (0.02 * v[1] * ufl.dx if led != "displacement" else 0)
+    problem = uem.UnitedProblem(
+        F, u, bcs=bcs, contacts=[uem.Contact(tags["under_punch"], uem.RigidPlane((0.0, 0.0), (0.0, -1.0)))]
+    )
+    problem.solve()
+    stored = COMM.allreduce(fem.assemble_scalar(forms.form(ufl.replace(work, {v: u}))))
+    assert np.isclose(uem.error_estimate(problem).norm, np.sqrt(stored), rtol=1e-10) and stored > 0
+
+
 def hertz(n, coupling, friction, degree=2):
     """A disc pressed on a block, three times as stiff, with n cells along a unit of length at the contact."""
     mesh, tags = uem.read_gmsh(

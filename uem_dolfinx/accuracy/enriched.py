@@ -62,7 +62,9 @@ class Enriched:
             return forms.form(forms.with_derivatives(J)[0])
 
         self._stiffness = stiffness(trial, self.test)
-        self.energy = abs(forms.assemble_scalar(stiffness(config.whole, config.whole), config.comm))
+        # the same displacement, of which nothing is a derivative
+        fixed = config.whole.copy()
+        self.energy = abs(forms.assemble_scalar(stiffness(fixed, fixed), config.comm))
         self.forces = self.residual = self.assembled(ufl.replace(F, {test: self.test}))
         self.traction = None
         if (found := contact_tractions(problem)) is not None:
