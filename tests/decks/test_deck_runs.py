@@ -265,3 +265,23 @@ def test_what_is_refused(folder):
     deck = ran(folder, two(step="*STEP\n*STATIC\n*DLOAD\n21, P2, 1.\n*END STEP\n"))
     refused(uem.InputError, ("node = 7", "no body"), lambda: deck.displacement(7))
     refused(uem.InputError, "no unknown temperatures", lambda: deck.temperature(101))
+
+
+def test_vibrations(folder):
+    """Of a column of two cells along itself, in the closed form of linear cells with their consistent mass; none without *FREQUENCY."""
+    rho, h = 7.8e-9, 0.5
+    text = (
+        columns([(0.0, 1.0, 2)]) + STEEL + "*SOLID SECTION, ELSET=body 1, MATERIAL=steel\n*BOUNDARY\nfoot 1, 1, 3\nhead 1, 1, 2\n"
+    )
+    wanted, loaded = "*STEP\n*FREQUENCY\n14\n*END STEP\n", "*STEP\n*STATIC\n*CLOAD\nhead 1, 3, -25.\n*END STEP\n"
+    deck = ran(
+        folder,
+        text.replace("*EXPANSION", f"*DENSITY\n{rho}\n*EXPANSION") + loaded + wanted.replace("*STEP", "*STEP, PERTURBATION"),
+    )
+    found, turn = deck.modes().frequencies, np.cos(np.array([1.0, 3.0]) * np.pi / 4)
+    exact = np.sqrt(6 * E / (rho * h**2) * (1 - turn) / (2 + turn)) / (2 * np.pi)
+    assert [np.abs(found / f - 1).min() for f in exact] == pytest.approx([0.0, 0.0], abs=1e-9) and deck.left_out == []
+    refused(
+        uem.InputError, "has no *DENSITY, and vibrations need the mass of all bodies", lambda: ran(folder, text + wanted).modes()
+    )
+    refused(uem.InputError, "the deck has no step *FREQUENCY", lambda: ran(folder, text + loaded).modes())

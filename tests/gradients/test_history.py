@@ -14,19 +14,20 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from gradient_scenes import DRAGGED, changed, control_of, dot, drag_anew, dragged
+from gradient_scenes import DRAGGED, DRAGGED_MORTAR, changed, control_of, dot, drag_anew, dragged
 from helpers import blocks, clamp, linear, modulus, refused, run, slow
 
 import uem_dolfinx as uem
 
 COMM = MPI.COMM_WORLD
+WAYS = [(*scene, "node_to_surface") for scene in DRAGGED] + [(*scene, "mortar") for scene in DRAGGED_MORTAR]
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize("cell, rigid, law, names", [DRAGGED[0], *(slow(*scene) for scene in DRAGGED[1:])])
-def test_of_second_order(cell, rigid, law, names):
+@pytest.mark.parametrize("cell, rigid, law, names, coupling", [WAYS[0], *(slow(*scene) for scene in WAYS[1:])])
+def test_of_second_order(cell, rigid, law, names, coupling):
     """``J(h) - J(0) - h J'`` vanishes with h^2 over all steps, for every kind of control, where the same contactors stick and slip."""
-    s = dragged(cell, rigid, law)
+    s = dragged(cell, rigid, law, coupling=coupling)
     found, told = s.solve(), {}
     assert any(0 < stick < active for active, stick in found.states)
     for name, by in zip(names, found.history.gradient(s.J, [control_of(s, found.contact, name) for name in names])):
@@ -93,7 +94,6 @@ def test_what_is_refused():
 
     refused(uem.InputTypeError, "problem = 3", lambda: record(3))
     for how, words in (
-        ({"coupling": "mortar"}, "coupling='node_to_surface' and cells of degree 1"),
         ({"sliding": "small"}, "sliding='finite'"),
         ({"friction": uem.Tresca(1.0)}, "Coulomb's law"),
         ({"friction": uem.Coulomb(0.3, 1.0)}, "Coulomb's law, without limit"),

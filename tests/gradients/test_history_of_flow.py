@@ -15,6 +15,10 @@ from history_scenes import COMM, alone, bent, slope_alone, taylor
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.materials.finite_plasticity import VARYING
+from uem_dolfinx.materials.hardening import Linear, Saturating
+from uem_dolfinx.materials.logarithmic import logarithmic_return, to_components, to_tensors
+from uem_dolfinx.materials.logarithmic_slopes import logarithmic_back
 from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
 from uem_dolfinx.materials.return_slopes import plane_stress_back, radial_back
 
@@ -23,6 +27,8 @@ SCENES = [
     slow({"friction": 0.2}),
     slow({"strain": "green_lagrange"}),
     slow({"cell": "hexahedron", "kind": "3d"}),
+    slow({"law_of": uem.FinitePlasticity}),
+    slow({"law_of": uem.FinitePlasticity, "cell": "hexahedron", "kind": "3d", "friction": 0.2}),
 ]
 
 
@@ -129,16 +135,69 @@ def test_slopes_of_returns(k):
         assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(slope, rel=1e-7, abs=1e-7 * np.abs(slope).max())
 
 
+@pytest.mark.parametrize("kind", ["plane_strain", "axisymmetric", "3d"])
+@pytest.mark.parametrize("curve", ["linear", "voce"])
+def test_slopes_of_the_return_in_finite_strain(kind, curve):
+    """By gradient, history and parameters, at strains of a third, against central differences."""
+    rng, n = np.random.default_rng(2), 40
+    varying, k = VARYING[kind], 6 if kind == "3d" else 4
+    c = len(varying[0])
+    flow, slope = 0.8 + 0.1 * rng.random(n), 15.0 * rng.random(n)
+    counts = rng.normal(size=(n, c)), rng.normal(size=(n, k)), rng.normal(size=n)
+    before = to_tensors(rng.normal(size=(n, k)) * 0.05)
+    begin = [
+        rng.normal(size=(n, c)) * 0.1,
+        to_components(before, k),
+        rng.random(n) * 0.01,
+        77.0 * (1.0 + rng.random(n)),
+        flow,
+        slope,
+    ]
+    begin[0][: n // 2] *= 0.01
+    begin[1][: n // 2] *= 0.01
+
+    def arguments(values):
+        """Of the return."""
+        moved, plastic, peeq, mu, flow, slope = values
+        gradient = np.zeros((n, 3, 3))
+        gradient[:, varying[0], varying[1]] = moved
+        return (
+            gradient,
+            plastic,
+            peeq,
+            mu,
+            Linear(flow, slope) if curve == "linear" else Saturating(flow, uem.Voce(0.5, 0.1, 2.0)),
+            varying,
+        )
+
+    def counted(values):
+        """What counts after a return."""
+        found = logarithmic_return(*arguments(values))
+        return (
+            (found.first_piola * counts[0]).sum(axis=1) + (found.plastic_strain * counts[1]).sum(axis=1) + found.peeq * counts[2]
+        )
+
+    flows = logarithmic_return(*arguments(begin)).peeq > begin[2]
+    assert flows.any() and not flows.all()
+    by = logarithmic_back(*arguments(begin), *counts)
+    found = [by.strain, by.plastic_strain, by.peeq, by.shear / begin[3], by.yield_stress]
+    sizes = [rng.normal(size=(n, c)) * 0.1, rng.normal(size=(n, k)) * 0.1, 0.1 * np.ones(n), 0.1 * begin[3], 0.1 * flow]
+    if curve == "linear":
+        found, sizes = [*found, by.hardening], [*sizes, slope]
+    for i, change in enumerate(sizes):
+        ends = [counted([*begin[:i], begin[i] + h * change, *begin[i + 1 :]]) for h in (-1e-5, 1e-5)]
+        told = (found[i] * change).reshape(n, -1).sum(axis=1)
+        assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(told, rel=1e-6, abs=1e-6 * np.abs(told).max()), i
+
+
 def test_what_is_refused():
     """Laws whose memory has no derivatives, and single states of those that have."""
     s = bent()
     v = ufl.TestFunction(s.V)
-    finite = uem.FinitePlasticity(s.u, 200.0, 0.3, 0.4, kind="plane_strain")
-    problem = uem.UnitedProblem(finite.residual(v), s.u, materials=[finite])
-    refused(uem.InputError, "through what FinitePlasticity remembers", uem.recording(problem).__enter__)
-    law = uem.VonMises(s.u, 200.0, 0.3, 0.4, kinematic_hardening=1.0, kind="plane_strain")
-    problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
-    refused(uem.InputError, "expected VonMises without back stresses", uem.recording(problem).__enter__)
+    for kind in (uem.VonMises, uem.FinitePlasticity):
+        law = kind(s.u, 200.0, 0.3, 0.4, kinematic_hardening=1.0, kind="plane_strain")
+        problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
+        refused(uem.InputError, "without back stresses as law with history", uem.recording(problem).__enter__)
     law = uem.VonMises(s.u, s.E, 0.3, 0.4, kind="plane_strain")
     problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
     refused(uem.InputError, "take the steps within uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, s.E))

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from gradient_scenes import DRAGGED, along, changed, control_of, dragged, wave
+from gradient_scenes import DRAGGED, DRAGGED_MORTAR, along, changed, control_of, dragged, wave
 from helpers import blocks, refused, slow
 from history_scenes import COMM, alone, bent, thrown
 
 import uem_dolfinx as uem
+
+WAYS = [(*scene, "node_to_surface") for scene in DRAGGED] + [(*scene, "mortar") for scene in DRAGGED_MORTAR]
 
 
 def both(u, J, history, pairs):
@@ -38,12 +40,12 @@ def pairs_of(s, contact, names):
     return [(control_of(s, contact, name), changed(s, name)) for name in names]
 
 
-@pytest.mark.parametrize("cell, rigid, law, names", [DRAGGED[0], *(slow(*scene) for scene in DRAGGED[1:])])
-def test_forward_as_backward(cell, rigid, law, names):
+@pytest.mark.parametrize("cell, rigid, law, names, coupling", [WAYS[0], *(slow(*scene) for scene in WAYS[1:])])
+def test_forward_as_backward(cell, rigid, law, names, coupling):
     """Over steps in which some contactors stick and others slip, along all controls at once, on any ranks."""
     found = []
     for comm in (COMM, alone()) if COMM.size > 1 else (COMM,):
-        s = dragged(cell, rigid, law, steps=3, comm=comm)
+        s = dragged(cell, rigid, law, steps=2 if coupling == "mortar" else 3, comm=comm, coupling=coupling)
         steps = s.solve()
         assert any(0 < stick < active for active, stick in steps.states)
         J = ufl.inner(s.u, s.u) * ufl.dx

@@ -173,15 +173,24 @@ DRAGGED = [
     ("hexahedron", "sphere", "linear", ("X", "place")),
 ]
 
+DRAGGED_MORTAR = [
+    ("triangle", None, "neo", ("friction", "X", "E", "top", "full")),
+    ("quadrilateral", None, "linear", ("friction", "X", "E", "top", "full")),
+    ("triangle", "plane", "linear", ("friction", "top", "full", "place")),
+    ("triangle", "sphere", "neo", ("friction", "X", "top", "full", "place")),
+    ("tetrahedron", None, "linear", ("E", "friction", "top")),
+    ("tetrahedron", "plane", "linear", ("friction", "X", "place", "top")),
+]
 
-def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM):
+
+def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="node_to_surface"):
     """A block that is pressed onto another, or onto a rigid surface, and dragged over it in some steps: some contactors stick, others slip.
 
     ``mu``: the coefficient of friction, or a function of a scalar space that returns a Function.
 
     ``solve()`` takes the steps anew with the present values of all that the solution depends on; ``values`` are those of the contact.
     """
-    b = blocks(comm, cell, *((3, 4) if cell == "triangle" else (2, 3)), overhang=0.25)
+    b = blocks(comm, cell, *((3, 4) if cell in ("triangle", "quadrilateral") else (2, 3)), overhang=0.25)
     mesh, g, u, v = b.scene.mesh, b.gdim, b.u, ufl.TestFunction(b.V)
     E, top, full = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.zeros(g)), fem.Constant(mesh, np.zeros(g))
     top.value[0], top.value[-1] = 0.03, -0.05
@@ -200,7 +209,7 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM):
             middle, up = [0.5] * (g - 1), np.eye(g)[-1] + 0.05 * np.eye(g)[0]
             target = uem.RigidPlane([*middle, 0.0], up) if rigid == "plane" else uem.RigidSphere([*middle, -3.0], 3.0)
             target.move(values["place"], values["turn"])
-        contact = uem.Contact(b.high, target, friction=values["friction"])
+        contact = uem.Contact(b.high, target, friction=values["friction"], coupling=coupling)
         bcs, load = [*clamp(b.V, b.bottom), push], {full: values["full"]}
         problem, states = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load=load, rtol=1e-13), []
         with uem.recording(problem) as history:

@@ -115,7 +115,7 @@ def taylor(s, changes, size=1e-3):
     return order, slope
 
 
-def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, steps=2, friction=0.0):
+def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, steps=2, friction=0.0, law_of=uem.VonMises):
     """A plastic block that is pressed against a rigid plane by its bottom, and goes back a little, in some steps each way.
 
     ``solve()`` makes the law anew with the present values of its parameters, and takes all steps.
@@ -137,7 +137,8 @@ def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, s
     def solve():
         u.x.array[:] = 0.0
         way = np.array(led.value)
-        law = uem.VonMises(u, E, nu, flow, hardening, kind=kind, strain=strain)
+        how = {} if law_of is uem.FinitePlasticity else {"strain": strain}
+        law = law_of(u, E, nu, flow, hardening, kind=kind, **how)
         F = law.residual(v) - ufl.inner(load, v) * ufl.dx
         contact = uem.Contact(top, uem.RigidPlane([0.0] * (g - 1) + [1.0], [0.0] * (g - 1) + [-1.0]), friction=friction)
         bcs = [fem.dirichletbc(led, fem.locate_dofs_topological(V, g - 1, bottom.entities), V)]

@@ -24,7 +24,8 @@ from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.decks.model import model_of
-from uem_dolfinx.decks.parts import TEMPERATURE, Course, Interaction, Linear, Model, Pair, Step
+from uem_dolfinx.decks.parts import SAME_LENGTH, TEMPERATURE, Course, Interaction, Linear, Model, Pair, Step
+from uem_dolfinx.dynamics.mass import consistent_mass
 from uem_dolfinx.errors import InputError, MissingFileError, SpaceError, TagError
 from uem_dolfinx.geometry.axisymmetry import axisymmetric
 from uem_dolfinx.geometry.cuts import BACK, cut
@@ -38,6 +39,7 @@ from uem_dolfinx.materials.elastic import LinearElastic, StVenantKirchhoff
 from uem_dolfinx.output.xdmf import geometry_degree
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.scripting import dirichlet, ds, dx
+from uem_dolfinx.solve.modes import Vibrations, modes
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
@@ -48,15 +50,6 @@ STRAINS_OF_TYPES = {"C3D": "3d", "CPE": "plane_strain", "CPS": "plane_stress", "
 #: Gaps up to this part of the model's size conduct heat: conductances of decks act before surfaces press.
 #: [convention; size of the model; test_deck_runs.py::test_gaps_that_conduct]
 CONDUCTS = 1e-4
-#: Steps of time of heat grow by this factor, up to a tenth of the step's duration.
-#: [convention; length of the step of time before; test_deck_runs.py::test_heat_in_steps_of_time]
-LONGER = 1.5
-#: Steps that are longer by less than this part are equally long.
-#: [bound; length of the step; -]
-SAME_LENGTH = 1e-6
-#: Number of steps of time of the greatest length.
-#: [convention; duration of the step; test_deck_runs.py::test_heat_in_steps_of_time]
-LEAST_STEPS = 10
 
 
 class Deck(given.Sealed):
@@ -122,6 +115,13 @@ class Deck(given.Sealed):
         """Take all steps, one converged load step or step of time after the other (collective); errors as of ``load_steps``."""
         yield from load_steps(self.problem, [one for k, step in enumerate(self.steps) for one in self._stages(k, step)])
 
+    def modes(self) -> Vibrations:
+        """As many modes as ``*FREQUENCY`` wants, about the present state; InputError without it, or densities (collective)."""
+        if not self._model.modes:
+            raise InputError("modes: the deck has no step *FREQUENCY")
+        mass = consistent_mass(self.problem.config.V, self._density("vibrations need"))
+        return modes(self.problem, self._model.modes, mass=mass)
+
     def displacement(self, node: int) -> Array:
         """Displacement of a node of the file by its number ``(gdim,)`` (collective); InputError if no body has this node."""
         return self._at(node)[: self.mesh.geometry.dim]
@@ -162,14 +162,11 @@ class Deck(given.Sealed):
             loads = self._loads(k, 0.0, 0.0, step.duration)
             yield OfUsers(f"step {k + 1}", n, bcs=bcs, contacts=changed, friction=friction, loads=loads, begin=begin)
             return
-        time, dt = 0.0, step.first
-        while time < step.duration:
-            dt = step.first if step.direct else min(dt, step.duration / LEAST_STEPS)
-            end = time + dt if time + (1.0 + SAME_LENGTH) * dt < step.duration else step.duration
+        for time, end in step.times():
             # conditions of heat act in full from the beginning
             begin, loads = self._pass(end - time), self._loads(k, 1.0, time, end)
             yield OfUsers(f"step {k + 1}", bcs=bcs, contacts=changed, friction=friction, loads=loads, begin=begin)
-            time, dt, changed, friction = end, dt * LONGER, {}, {}
+            changed, friction = {}, {}
 
     def _friction_of(self, k: int, step: Step) -> dict[Contact, Any]:
         """Coefficients of friction that a step changes; at first, of contacts that have friction in later steps only, 0."""
@@ -335,18 +332,19 @@ class Deck(given.Sealed):
             tag, x = self._tag(where[0]), ufl.SpatialCoordinate(self.mesh)
             # bodies that turn move out
             x = x + w if law_of is StVenantKirchhoff else x
-            F -= self._driven_by("bodies", where) * self._density(tag) * ufl.inner(where[1].acceleration(x), v) * dx(tag)
+            work = self._density("a load acts on", tag) * ufl.inner(where[1].acceleration(x), v) * dx(tag)
+            F -= self._driven_by("bodies", where) * work
         return F
 
-    def _density(self, tag: Tag) -> fem.Function:
-        """The density in cells; InputError for materials without, of cells of a tag (collective)."""
+    def _density(self, what: str, tag: Tag | None = None) -> fem.Function:
+        """The density in cells; InputError for materials without, of cells of a tag or of any, with what needs it (collective)."""
         rho = fem.Function(compat.function_space(self.mesh, ("DG", 0)))
         dofs = compat.cell_dofs(rho.function_space)[:, 0]
         for elements, name in self._model.sections:
             cells = self._tag(elements).entities
             rho.x.array[dofs[cells]] = density = self._model.materials[name].density
-            if reduced(self.mesh.comm, not density and bool(np.isin(cells, tag.entities).any()), op=MPI.LOR):
-                raise InputError(f"material '{name}' has no *DENSITY, and a load acts on the mass of {tag}")
+            if reduced(self.mesh.comm, not density and (tag is None or bool(np.isin(cells, tag.entities).any())), op=MPI.LOR):
+                raise InputError(f"material '{name}' has no *DENSITY, and {what} the mass of {tag or 'all bodies'}")
         return rho
 
     def _outside(self, tag: Tag) -> Tag:
@@ -401,11 +399,10 @@ def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
 
     Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
     ``*BOUNDARY``, ``*CLOAD``, pressures, ``GRAV`` and ``CENTRIF`` by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``,
-    ``*CONTACT PAIR``, ``*TIE``,
-    ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of contact pairs,
-    ``*RIGID BODY`` and ``*PRE-TENSION SECTION``, whose surface is cut; values that follow an ``*AMPLITUDE``, or are in the directions of
-    a ``*TRANSFORM``; steps ``*STATIC``, ``*HEAT TRANSFER`` and
-    ``*COUPLED TEMPERATURE-DISPLACEMENT``. Cells of several kinds, prisms and pyramids are divided into simplices.
+    ``*CONTACT PAIR``, ``*TIE``, ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of
+    contact pairs, ``*RIGID BODY`` and ``*PRE-TENSION SECTION``, whose surface is cut; values that follow an ``*AMPLITUDE``, or are in
+    the directions of a ``*TRANSFORM``; steps ``*STATIC``, ``*HEAT TRANSFER``, ``*COUPLED TEMPERATURE-DISPLACEMENT`` and
+    ``*FREQUENCY``. Cells of several kinds, prisms and pyramids are divided into simplices.
     All else is in ``left_out`` and in the log.
 
     Args:

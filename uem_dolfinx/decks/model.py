@@ -41,7 +41,8 @@ KNOWN_OPTIONS = {
     "ELASTIC": "TYPE", "EXPANSION": "TYPE ZERO", "SOLID SECTION": "ELSET MATERIAL ORIENTATION OFFSET", "MATERIAL": "NAME",
     "SURFACE INTERACTION": "NAME", "SURFACE BEHAVIOR": "PRESSURE-OVERCLOSURE", "CONTACT PAIR": "INTERACTION TYPE ADJUST SMALL_SLIDING",
     "TIE": "NAME POSITION_TOLERANCE ADJUST", "PRE-TENSION SECTION": "SURFACE NODE", "INITIAL CONDITIONS": "TYPE",
-    "STEP": "INC NLGEOM NAME", "BOUNDARY": "OP AMPLITUDE", "CLOAD": "OP AMPLITUDE", "DLOAD": "OP AMPLITUDE",
+    "STEP": "INC NLGEOM NAME PERTURBATION", "FREQUENCY": "SOLVER STORAGE EIGENSOLVER",
+    "BOUNDARY": "OP AMPLITUDE", "CLOAD": "OP AMPLITUDE", "DLOAD": "OP AMPLITUDE",
     "DSLOAD": "OP AMPLITUDE", "AMPLITUDE": "NAME TIME",
     "RIGID BODY": "NSET ELSET REF_NODE ROT_NODE", "TRANSFORM": "NSET TYPE", "TEMPERATURE": "OP",
     "MODEL CHANGE": "TYPE ADD REMOVE", "CHANGE FRICTION": "INTERACTION", "STATIC": "SOLVER DIRECT",
@@ -59,6 +60,7 @@ class _Reader:
         self._amplitudes: dict[str, Course] = {}
         self._axes: dict[int, Array] = {}  # local directions of nodes
         self._changed = ""  # the interaction whose friction a step changes
+        self._perturbs = False
         self._step, self._dim = self._begin, 3 if any(name.startswith("C3D") for name in deck.types) else 2
         #: Kinds of conditions of this step, and what they have set.
         self._met, self._own = set[str](), set[tuple[str, Any, Any]]()
@@ -77,6 +79,11 @@ class _Reader:
 
     def take(self, keyword: str, options: dict[str, str], rows: list[list[str]]) -> bool:
         """Store the data of a keyword; whether it has a counterpart here."""
+        if keyword == "FREQUENCY":
+            # about the state of a static step, which changes nothing
+            if self.model.steps and not self._perturbs:
+                self.model.left_out.append("*FREQUENCY without PERTURBATION: about the state of the last step")
+            self.model.modes, keyword, rows = int(rows[0][0]), "STATIC", []
         if keyword in STEP_KINDS:
             times = [*_numbers(rows[0] if rows else []), 0.0, 0.0]
             duration = times[1] or 1.0
@@ -218,7 +225,7 @@ class _Reader:
 
     def _new_step(self, options: dict[str, str], rows: list[list[str]]) -> None:
         last = self.model.steps[-1] if self.model.steps else self._begin
-        self._met, self._own, self._changed = set(), set(), ""
+        self._met, self._own, self._changed, self._perturbs = set(), set(), "", "PERTURBATION" in options
         self._step = Step(
             nlgeom="NLGEOM" in options and options["NLGEOM"].upper() != "NO", held=_kept(last.held, last),
             forces=_kept(last.forces, last), pressures=_kept(last.pressures, last), bodies=_kept(last.bodies, last),
@@ -345,7 +352,7 @@ def model_of(deck: Deck) -> Model:
     if reader.model.thickness != 1.0:
         left_out.append(f"thickness {reader.model.thickness}: forces of contacts and sections are those of a thickness of 1")
     if not reader.model.steps:
-        raise InputError(f"the deck has no step that can be taken: expected *STEP with one of {', '.join(STEP_KINDS)}")
+        raise InputError(f"the deck has no step that can be taken: expected *STEP with one of {', '.join(STEP_KINDS)}, FREQUENCY")
     reader.closing().close()
     left_out[:] = dict.fromkeys(left_out)
     return reader.model

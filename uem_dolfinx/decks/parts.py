@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -17,6 +18,15 @@ STEP_KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT T
 #: Number of the temperature among the degrees of freedom.
 #: [format; number; -]
 TEMPERATURE = 11
+#: Steps of time of heat grow by this factor, up to a tenth of the step's duration.
+#: [convention; length of the step of time before; test_deck_runs.py::test_heat_in_steps_of_time]
+LONGER = 1.5
+#: Steps that are longer by less than this part are equally long.
+#: [bound; length of the step; -]
+SAME_LENGTH = 1e-6
+#: Number of steps of time of the greatest length.
+#: [convention; duration of the step; test_deck_runs.py::test_heat_in_steps_of_time]
+LEAST_STEPS = 10
 
 #: A set or a node, by name, and a degree of freedom, or the label of a load.
 Where: TypeAlias = tuple[str, Any]
@@ -176,6 +186,15 @@ class Step:
     friction: dict[str, float] = field(default_factory=dict)
     motions: dict[tuple[str, int, int], Value] = field(default_factory=dict)
 
+    def times(self) -> Iterator[tuple[float, float]]:
+        """Beginnings and ends of steps of time, which grow."""
+        time, dt = 0.0, self.first
+        while time < self.duration:
+            dt = self.first if self.direct else min(dt, self.duration / LEAST_STEPS)
+            end = time + dt if time + (1.0 + SAME_LENGTH) * dt < self.duration else self.duration
+            yield time, end
+            time, dt = end, dt * LONGER
+
 
 @dataclass
 class Model:
@@ -188,6 +207,7 @@ class Model:
         initial: temperatures at the start, by set or node.
         rigid: set, position, and nodes of translation and rotation of each rigid body.
         pretension: surface, reference node and axis of each section of a bolt.
+        modes: number of vibrations that are wanted after the last step; 0 for none.
         left_out: what has no counterpart here, or is read otherwise than it stands.
     """
 
@@ -202,6 +222,7 @@ class Model:
     rigid: list[tuple[str, list[float], int, int]] = field(default_factory=list)
     pretension: list[tuple[str, str, list[float]]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
+    modes: int = 0
     left_out: list[str] = field(default_factory=list)
 
     @property

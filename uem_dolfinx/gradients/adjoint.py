@@ -55,11 +55,10 @@ class Adjoint:
         of_u = at.held(of_u)
         lift = at.lift(weights)
         drive = of_u + at.stiffness_back(lift) + now + at.vector(handed)
-        whole = at.solve_back(drive)
+        whole, self.left = at.adjoint(drive)
         left = whole - lift
         self.a = at.derivatives.a
         self.terms = *((functional, 1.0) for functional in functionals), (at.derivatives.work, -1.0)
-        self.left = drive - at.stiffness_back(whole)
         at.derivatives.along(config.from_rows(left.array_r))
         self.by_values = np.where(at.problem.bodies.free_rows, 0.0, at.P.carried_back(self.left))
         #: Derivative by the positions of the nodes, without the shape derivatives of the integrals in J and F ``(n_owned * gdim,)``.
@@ -69,7 +68,7 @@ class Adjoint:
     @cached_property
     def by_gaps(self) -> Array:
         """Derivative by the gaps of all equations ``(m,)`` (first time: collective)."""
-        return -self.at.followers.back(self.at.P.multipliers(self.at.P.pass_on(self.left)))
+        return self.at.by_gaps(self.left)
 
     @property
     def _at_nodes(self) -> Array:

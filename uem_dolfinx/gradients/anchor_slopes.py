@@ -30,6 +30,34 @@ from uem_dolfinx.parallel import reduced
 BEYOND = "edge of the target is nearest to"
 
 
+def refuse_some(pair: Interface, which: Bools, words: str) -> None:
+    """Refuse contactors of an interface through which there are no derivatives ``(n,)`` (collective).
+
+    Raises:
+        InputError: names a contact, and says what holds them.
+    """
+    count = int(reduced(pair.config.comm, int(which.sum())))
+    if count:
+        names = pair.config.comm.allgather([name_at(pair, i) for i in np.flatnonzero(which)[:1]])
+        name = next(filter(None, names))[0]
+        raise InputError(
+            f"contact '{name}': a {words} {count} contactor(s), through which histories have no derivatives; take another mesh, other "
+            "steps, or differences of two solutions"
+        )
+
+
+def turn_by_slip(pair: Interface) -> None:
+    """Set directions that depend on slip and force in equal parts, which does not affect the stiffness S in equilibrium (collective)."""
+    sliding, state = pair.friction, pair.trial
+    assert sliding is not None and state.friction is not None
+    w, bound, slips = sliding.frame.slip, sliding.bound(state), sliding.slipping(state)
+    way = np.linalg.norm(w, axis=1)
+    refuse_some(pair, slips & ((way == 0.0) | (bound == 0.0)), "slip without way or without force turns")
+    c = np.where(slips, bound / np.where(way > 0.0, way, 1.0), 0.0)
+    q = c[:, None] * w - sliding.frame.tangential(state.friction.tau)
+    pair.take(state, replace(sliding.pivot, stiffness=c, q=q))
+
+
 class AnchorSlopes:
     """Derivatives of one converged step of a contact with friction of nodes, by its anchors (collective).
 
@@ -54,30 +82,10 @@ class AnchorSlopes:
         self._slips = self._sliding.slipping(state)
         self._anchor, friction = self._tangents_at_anchors(), self._sliding
         at_edges = self._slips & (pair.kinematics.pressure_map(False).force != pair.kinematics.ties.share)
-        self._refuse(active & (state.in_corner | friction.frame.cornered | at_edges), "corner of the target holds")
-        self._refuse(self.stuck & friction.left_out.any(axis=1), "dependent equation along the target holds")
+        refuse_some(self._pair, active & (state.in_corner | friction.frame.cornered | at_edges), "corner of the target holds")
+        refuse_some(self._pair, self.stuck & friction.left_out.any(axis=1), "dependent equation along the target holds")
         if self._config.gdim == 3:
-            self._turn_by_slip()
-
-    def _refuse(self, which: Bools, words: str) -> None:
-        count = int(reduced(self._config.comm, int(which.sum())))
-        if count:
-            names = self._config.comm.allgather([name_at(self._pair, i) for i in np.flatnonzero(which)[:1]])
-            name = next(filter(None, names))[0]
-            raise InputError(
-                f"contact '{name}': a {words} {count} contactor(s), through which histories have no derivatives; take another mesh, other "
-                "steps, or differences of two solutions"
-            )
-
-    def _turn_by_slip(self) -> None:
-        """Set directions that depend on slip and force in equal parts, which does not affect the stiffness S in equilibrium."""
-        w, bound, state = self._sliding.frame.slip, self._sliding.bound(self._pair.trial), self._pair.trial
-        way = np.linalg.norm(w, axis=1)
-        self._refuse(self._slips & ((way == 0.0) | (bound == 0.0)), "slip without way or without force turns")
-        c = np.where(self._slips, bound / np.where(way > 0.0, way, 1.0), 0.0)
-        assert state.friction is not None
-        q = c[:, None] * w - self._sliding.frame.tangential(state.friction.tau)
-        self._pair.take(state, replace(self._sliding.pivot, stiffness=c, q=q))
+            turn_by_slip(pair)
 
     def turned(self, state: PairState) -> list[tuple[Ints, Array]]:
         """Terms of slip with the forces of a state, lists of global nodes and blocks as in ``Interface.curvature`` (collective).
@@ -97,6 +105,15 @@ class AnchorSlopes:
         leaning = np.column_stack([self._config.to_global(self._pair.nodes[i]), p.nodes[i]]), blocks
         return [leaning, *(terms[:2] for terms in [self._sliding.slip_terms(state, kinematics)] if terms is not None)]
 
+    def leaning(self, equations: ContactRows) -> None:
+        """None: contactors that stick are at their anchors."""
+
+    def of_contact(self, by_anchors: Array, rows: slice) -> Array:
+        """The derivatives by the anchors of some contactors."""
+        found = np.zeros_like(by_anchors)
+        found[rows] = by_anchors[rows]
+        return found
+
     def without_stuck(self, state: PairState) -> PairState:
         """The state with zero forces of contactors at their anchors, since their equations do not rotate."""
         return replace(state, nodal=np.where(self.stuck, 0.0, state.nodal))
@@ -110,6 +127,11 @@ class AnchorSlopes:
             return np.einsum("naf,nag->nfg", target.shape.tabulate(f.xi).dN, target.of_facets(f.facet, own.x))
         along = np.broadcast_to(np.eye(self._config.gdim)[:, None], (self._config.gdim, *f.anchor.shape))
         return np.stack([e if target.motion is None else target.motion.turn(e) for e in along], axis=1)
+
+    @property
+    def none(self) -> Array:
+        """No changes of the anchors."""
+        return np.zeros((len(self._pair.nodes), self.size))
 
     @property
     def size(self) -> int:
@@ -157,7 +179,7 @@ class AnchorSlopes:
             if self._config.gdim == 3:
                 beyond = np.zeros(len(loose), dtype=bool)
                 beyond[i] = ~free.all(axis=1)
-                self._refuse(beyond, BEYOND)
+                refuse_some(self._pair, beyond, BEYOND)
             forces = np.einsum("kf,kfi->ki", np.where(free, by_anchors[i], 0.0), D).reshape(-1, self._config.gdim)
             nodes = np.column_stack([self._config.to_global(pair.nodes[i]), p.nodes[i]])
             own = self._config.add_at_owners(nodes.ravel(), forces)
@@ -201,7 +223,7 @@ class AnchorSlopes:
         """
         pair, kinematics, config = self._pair, self._pair.kinematics, self._config
         needed = self.stuck | (self._slips & (config.gdim == 3))
-        self._refuse(needed & np.isnan(moved).any(axis=1), BEYOND)
+        refuse_some(self._pair, needed & np.isnan(moved).any(axis=1), BEYOND)
         moved = np.where(needed[:, None], moved, 0.0)
         there, own = np.einsum("nkg,nk->ng", self._anchor, moved), np.zeros((config.n_owned, config.gdim))
         stuck = np.where(self.stuck[:, None], there, 0.0)

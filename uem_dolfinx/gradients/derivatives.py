@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import ufl
@@ -15,6 +16,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Forms whose derivatives are summed, each with its sign.
 Terms = Sequence[tuple[ufl.Form, float]]
@@ -135,3 +137,16 @@ def along(form: ufl.Form, m: fem.Constant | fem.Function, change: Any) -> ufl.Fo
         parts = [float(np.asarray(change)[i]) * (by[i] if i else by) for i in np.ndindex(shape) if np.asarray(change)[i] != 0.0]
         integrals += [integral.reconstruct(integrand=sum(parts[1:], parts[0]))] if parts else []
     return forms.expanded(ufl.Form(integrals))
+
+
+#: Derivatives of problems, compiled for their gradients so far.
+_KEPT: WeakKeyDictionary[UnitedProblem, Derivatives] = WeakKeyDictionary()
+
+
+def derivatives_of(problem: UnitedProblem) -> Derivatives:
+    """Derivatives of a problem's residual and of functionals, reused from its last gradient."""
+    F, kept = problem.bodies.F, _KEPT.get(problem)
+    if kept is None or kept.F is not F:
+        kept = _KEPT[problem] = Derivatives(F, problem.u.function_space, problem.config.V)
+    kept.begin()
+    return kept

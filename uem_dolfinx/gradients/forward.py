@@ -25,10 +25,18 @@ from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.derivatives import Derivatives, along
 from uem_dolfinx.gradients.gradient import AnyControl
 from uem_dolfinx.gradients.linearised import Motion
+from uem_dolfinx.gradients.mean_slopes import MeanSlopes
 from uem_dolfinx.gradients.parameters import ContactParameter, motion_of
 from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.records import Record
-from uem_dolfinx.gradients.sweep import LinearisedStep, accelerations, anchor_slopes_of, place_at_start
+from uem_dolfinx.gradients.sweep import (
+    LEANS_NO_MORE,
+    MOST_LEANING,
+    LinearisedStep,
+    accelerations,
+    anchor_slopes_of,
+    place_at_start,
+)
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.memory import Memory
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -47,6 +55,19 @@ class ForwardStep(LinearisedStep):
         """``P dq`` with ``Q'(K + G)P dq = Q' forces`` (collective)."""
         dq, _ = self.problem.solver.solve(self.Q.transpose(forces))
         return self.P.expand(self.problem.solver.complete(dq))
+
+    def moved(
+        self, direction: Sequence[tuple[AnyControl, Any]], gaps: Array | float = 0.0, pushed: Array | float = 0.0
+    ) -> Motion:
+        """With rows that lean, see ``LinearisedStep.adjoint`` (collective)."""
+        motion, before = super().moved(direction, gaps, pushed), np.zeros(1)
+        for _ in range(MOST_LEANING if self._leaning else 0):
+            more = self.leaned(self.config.of(motion.du.x.array + motion.shape.x.array)[: self.config.n_owned])
+            size, off = reduced(self.config.comm, np.array([(more**2).sum(), ((more - before) ** 2).sum()]))
+            if off <= LEANS_NO_MORE**2 * size:
+                return motion
+            motion, before = super().moved(direction, gaps + more, pushed), more
+        return self._given_up() if self._leaning else motion
 
     def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
         """``(K + G) du``, with what K lacks at prescribed displacements (collective)."""
@@ -138,9 +159,7 @@ class Forward:
             if isinstance(m, ufl.SpatialCoordinate):
                 shape += self._at_nodes(places.at_nodes(change))
         slopes = anchor_slopes_of(problem)
-        self._anchors = [
-            np.zeros((0, 0)) if at is None else np.zeros((len(p.nodes), at.size)) for at, p in zip(slopes, problem.interfaces)
-        ]
+        self._anchors = [np.zeros((0, 0)) if at is None else at.none for at in slopes]
         self._follow(slopes, shape, True)
 
     def advance(self, record: Record) -> None:
@@ -185,7 +204,7 @@ class Forward:
         for law in self._laws:
             law.end()
 
-    def _follow(self, slopes: Sequence[AnchorSlopes | None], way: Array, first: bool) -> None:
+    def _follow(self, slopes: Sequence[AnchorSlopes | MeanSlopes | None], way: Array, first: bool) -> None:
         """Compute changes of the anchors, with those of the owned nodes ``way (n_owned, gdim)`` (collective)."""
         for k, (at, pair) in enumerate(zip(slopes, self.problem.interfaces)):
             if at is not None:

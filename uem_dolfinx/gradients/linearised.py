@@ -30,7 +30,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -49,7 +48,8 @@ from uem_dolfinx.form_checks import Control
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.contact_fields import along_field
-from uem_dolfinx.gradients.derivatives import Derivatives, along, transposed, values_in
+from uem_dolfinx.gradients.derivatives import Derivatives, along, derivatives_of, transposed, values_in
+from uem_dolfinx.gradients.mean_slopes import MeanSlopes
 from uem_dolfinx.gradients.parameters import (
     ContactParameter,
     acting,
@@ -93,19 +93,6 @@ class Motion(NamedTuple):
     reactions: PETSc.Vec
 
 
-#: Derivatives of problems, compiled for their gradients so far.
-_KEPT: WeakKeyDictionary[UnitedProblem, Derivatives] = WeakKeyDictionary()
-
-
-def _derivatives_of(problem: UnitedProblem) -> Derivatives:
-    """Derivatives of a problem's residual and of functionals, reused from its last gradient."""
-    F, kept = problem.bodies.F, _KEPT.get(problem)
-    if kept is None or kept.F is not F:
-        kept = _KEPT[problem] = Derivatives(F, problem.u.function_space, problem.config.V)
-    kept.begin()
-    return kept
-
-
 class Linearised:
     """The constrained problem linearised at the equilibrium, which is restored in the end (collective).
 
@@ -122,7 +109,7 @@ class Linearised:
     P: Restriction
     rows: Rows
     multipliers: Array
-    slopes: Sequence[AnchorSlopes | None] = ()
+    slopes: Sequence[AnchorSlopes | MeanSlopes | None] = ()
 
     def __init__(self, problem: UnitedProblem, derivatives: Derivatives | None = None, held: Array | float | None = None):
         self.problem, self.config = problem, problem.config
@@ -133,7 +120,7 @@ class Linearised:
         # number of the displacement's components on this rank, which come first in vectors
         self._n = problem.config.n_owned * problem.config.gdim
         self.F = problem.bodies.F
-        self.derivatives = derivatives or _derivatives_of(problem)
+        self.derivatives = derivatives or derivatives_of(problem)
         known = uniform(problem, problem.progress.taken.held if held is None else held)
         self.users = Users(problem, float("nan" if known is None else known))
 
@@ -281,6 +268,15 @@ class Linearised:
         if self._turns_back:
             self.problem.solver.set_operator(self.P, self._K_back, self._G_back)
         return self.solve(forces)
+
+    def adjoint(self, drive: PETSc.Vec) -> tuple[PETSc.Vec, PETSc.Vec]:
+        """``a = Q mu`` under a load of the adjoint problem, and the residual that it leaves (collective)."""
+        whole = self.solve_back(drive)
+        return whole, drive - self.stiffness_back(whole)
+
+    def by_gaps(self, left: PETSc.Vec) -> Array:
+        """Derivative by the gaps of all equations ``(m,)``, from the residual of the adjoint problem (collective)."""
+        return -self.followers.back(self.P.multipliers(self.P.pass_on(left)))
 
     def stiffness(self, du: PETSc.Vec) -> PETSc.Vec:
         """``(K + G) du`` (collective)."""

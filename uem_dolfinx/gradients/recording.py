@@ -10,6 +10,7 @@ from typing import Any
 from uem_dolfinx import given
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.law import as_law, follows_load
+from uem_dolfinx.contact.mortar.placement import MortarKinematics
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.gradients.gradient import AnyControl, check_controls, check_problem
@@ -40,16 +41,16 @@ def recording(
     the residual.
 
     Args:
-        problem: in statics or in time; supported are Coulomb friction between nodes of degree 1 and surfaces with sliding='finite', and
-            ``VonMises`` as law with history.
+        problem: in statics or in time; supported are Coulomb friction on cells of degree 1 with sliding='finite', and ``VonMises`` or
+            ``FinitePlasticity`` without back stresses as law with history.
         scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
         controls: of the derivatives that are wanted later, if known: those without derivatives are refused before the first step.
 
     Yields: The history, which may be used in the block and after it.
 
     Raises:
-        InputError, InputTypeError: for a problem without such derivatives: with mortar and friction, other laws with history or of
-            friction, wear, ties, offsets of contacts with friction, or in time sliding='small'; or if the folder does not exist.
+        InputError, InputTypeError: for a problem without such derivatives: with other laws with history or of friction, wear, ties,
+            offsets of contacts with friction, or in time sliding='small'; or if the folder does not exist.
     """
     check_problem(problem)
     with agreed(problem.comm):
@@ -74,7 +75,7 @@ def recording(
             if not getattr(material, "has_slopes", False):
                 raise InputError(
                     f"a history has no derivatives through what {type(material).__name__} remembers: expected VonMises "
-                    "without back stresses as law with history; else take differences of runs"
+                    "or FinitePlasticity without back stresses as law with history; else take differences of runs"
                 )
         try:
             history = History(problem, None if scratch is None else Path(scratch))
@@ -101,12 +102,15 @@ def _check_first(problem: UnitedProblem, what: str) -> None:
 
 def _check_friction(problem: UnitedProblem, contact: Any) -> None:
     """Refuse contacts with friction whose history has no derivatives."""
-    pair, law = contact.pair, as_law(contact.friction)
+    pair, law, config = contact.pair, as_law(contact.friction), problem.config
+    means = pair.whole.kinematics
+    mortar = isinstance(means, MortarKinematics) and not (config.axisymmetric or means.of.elimination.seam.any)
     for wrong, expected in (
         (
-            not pair.discretisation.traits.pointwise or problem.config.degree > 1,
-            "coupling='node_to_surface' and cells of degree 1",
+            not (pair.discretisation.traits.pointwise or mortar),
+            "coupling='node_to_surface', and 'mortar' without an axis of revolution or periodic surfaces",
         ),
+        (config.degree > 1, "cells of degree 1"),
         (contact.sliding != "finite", "sliding='finite'"),
         (contact.normals != "facet", "normals='facet'"),
         (type(law) is not Coulomb or law.per_area or law.per_point or follows_load(law), "Coulomb's law, without limit or load"),

@@ -15,7 +15,8 @@ friction, velocities and accelerations, and the histories of laws.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import cached_property
+from typing import Any, NoReturn
 
 import numpy as np
 import ufl
@@ -24,18 +25,19 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.entries import is_symmetric
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.dynamics.first_acceleration import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
-from uem_dolfinx.errors import InputError
+from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.gradients.adjoint import Adjoint
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
 from uem_dolfinx.gradients.derivatives import Derivatives, transposed
 from uem_dolfinx.gradients.gradient import AnyControl
 from uem_dolfinx.gradients.linearised import Linearised
-from uem_dolfinx.gradients.parameters import ContactParameter, led_for, motion_of
+from uem_dolfinx.gradients.mean_slopes import MeanSlopes
+from uem_dolfinx.gradients.parameters import ContactParameter, contactors_of, led_for, motion_of
 from uem_dolfinx.gradients.records import Record
 from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
 from uem_dolfinx.parallel import reduced
@@ -43,6 +45,13 @@ from uem_dolfinx.solve.bodies.tangent import contact_curvature, together
 from uem_dolfinx.solve.memory import Memory
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.united.system import BodySystem
+
+#: The part of rows that lean is found when it changes the load of the adjoint problem by no more than this part.
+#: [bound; load of the adjoint problem; -]
+LEANS_NO_MORE = 1e-12
+#: Solves for that part.
+#: [bound; solves; -]
+MOST_LEANING = 50
 
 
 class Sweep:
@@ -290,6 +299,55 @@ class LinearisedStep(Linearised):
             found.array[:] += self._rates.beyond_tangent(np.array(a.array_r), self.damped)
         return found
 
+    def adjoint(self, drive: PETSc.Vec) -> tuple[PETSc.Vec, PETSc.Vec]:
+        """With rows that lean, which the matrix leaves out: again and again, until their part stays as it is (collective)."""
+        whole, left = super().adjoint(drive)
+        before = None
+        for _ in range(MOST_LEANING if self._leaning else 0):
+            by_gaps, more = self.by_gaps(left), np.zeros((self.config.n_owned, self.config.gdim))
+            for row, nodes, coefficients in self._leaning:
+                by = (by_gaps[row, None, None] * coefficients).reshape(-1, self.config.gdim)
+                more += self.config.add_at_owners(np.maximum(nodes, 0).ravel(), by)
+            load = drive + self.vector(more)
+            if before is not None and (load - before).norm() <= LEANS_NO_MORE * load.norm():
+                return whole, left
+            whole, left = super().adjoint(load)
+            before = load
+        return self._given_up() if self._leaning else (whole, left)
+
+    def leaned(self, way: Array) -> Array:
+        """Changes of the gaps of all equations by rows that lean, for changes of positions ``(n_owned, gdim)``: ``(m,)`` (collective)."""
+        found = np.zeros_like(self.multipliers)
+        for row, nodes, coefficients in self._leaning:
+            there = self.config.ask_owners(np.maximum(nodes, 0).ravel(), way).reshape(coefficients.shape)
+            found[row] = np.einsum("kcg,kcg->k", coefficients, there)
+        return found
+
+    def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
+        """With rows that lean as the target moves (collective)."""
+        gaps, pushed = super().changes(m, entry)
+        if m.parameter in ("place", "turn"):
+            own, which = self.equations_of(m.contact)
+            leaned = self.leaned(motion_of(m, self.config.x[: self.config.n_owned], entry))[which]
+            gaps[which] -= np.where(contactors_of(own, m.contact.pair), leaned, 0.0)
+        return gaps, pushed
+
+    def _given_up(self) -> NoReturn:
+        raise LinearSolveError(
+            "contactors that stick have come so far along their normals in a step, while these turn, that its derivatives are not found: "
+            "take shorter steps, or coupling='node_to_surface'"
+        )
+
+    @cached_property
+    def _leaning(self) -> list[tuple[Ints, Ints, Array]]:
+        """Parts of rows that the matrix leaves out, with numbers of equations; empty if no rank has any (first time: collective)."""
+        found, first = [], 0
+        for slopes, own in zip(self.slopes, self.equations):
+            if slopes is not None and (part := slopes.leaning(own)) is not None:
+                found.append((first + part[0], *part[1:]))
+            first += len(own)
+        return found if reduced(self.config.comm, int(any(part[2].any() for part in found))) else []
+
     def by_anchors(self, adjoint: Adjoint, kept: list[Array]) -> list[Array]:
         """Derivatives by the initial anchors of the step, including unchanged anchors (collective)."""
         n, g = self.config.n_owned, self.config.gdim
@@ -310,13 +368,14 @@ def damped_by(problem: UnitedProblem, derivatives: Derivatives, a: PETSc.Vec) ->
     return 0.0 if found is None else found
 
 
-def anchor_slopes_of(problem: UnitedProblem) -> list[AnchorSlopes | None]:
-    """Derivatives by anchors in the present trial states, None without friction (collective)."""
-    return [AnchorSlopes(pair) if pair.friction is not None else None for pair in problem.interfaces]
+def anchor_slopes_of(problem: UnitedProblem) -> list[AnchorSlopes | MeanSlopes | None]:
+    """Derivatives by anchors, or positions, in the present trial states, None without friction (collective)."""
+    kinds = ((AnchorSlopes if pair.discretisation.traits.pointwise else MeanSlopes, pair) for pair in problem.interfaces)
+    return [kind(pair) if pair.friction is not None else None for kind, pair in kinds]
 
 
 def _back(
-    problem: UnitedProblem, by_anchors: list[Array], slopes: Sequence[AnchorSlopes | None], first: bool = False
+    problem: UnitedProblem, by_anchors: list[Array], slopes: Sequence[AnchorSlopes | MeanSlopes | None], first: bool = False
 ) -> tuple[Array, list[Array]]:
     """Derivatives by positions of the owned nodes ``(n_owned, gdim)``, from derivatives by anchors, and by unchanged ones (collective)."""
     handed, left = np.zeros((problem.config.n_owned, problem.config.gdim)), []
@@ -332,16 +391,14 @@ def _left_behind(
     problem: UnitedProblem,
     m: ContactParameter,
     by_anchors: list[Array],
-    slopes: Sequence[AnchorSlopes | None],
+    slopes: Sequence[AnchorSlopes | MeanSlopes | None],
     first: bool = False,
 ) -> Array:
     """Derivatives by a motion of the target, from derivatives by anchors, the positions of its contactors relative to it (collective)."""
     found, (whole, rows) = np.zeros(m.shape(problem.config.gdim)), table_of(m.contact.pair)
     k = problem.interfaces.index(whole)
     if m.parameter in ("place", "turn") and (at := slopes[k]) is not None:
-        own = np.zeros_like(by_anchors[k])
-        own[rows] = by_anchors[k][rows]
-        handed, _ = at.back(own, first)
+        handed, _ = at.back(at.of_contact(by_anchors[k], rows), first)
         for entry in np.ndindex(found.shape):
             found[entry] = -(handed * motion_of(m, problem.config.x[: len(handed)], entry)).sum()
     return np.asarray(reduced(problem.comm, found))

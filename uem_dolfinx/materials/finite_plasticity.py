@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import ufl
@@ -17,6 +18,9 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.materials.hardening import Linear, Saturating, Voce, YieldCurve, is_table, read_table
 from uem_dolfinx.materials.logarithmic import Flowed, logarithmic_return, to_components, to_tensors
 from uem_dolfinx.materials.von_mises import VonMises
+
+if TYPE_CHECKING:
+    from uem_dolfinx.materials.return_slopes import ByReturn
 
 #: Components of F that vary in each kind, by row and column.
 VARYING = {
@@ -73,8 +77,6 @@ class FinitePlasticity(VonMises):
         InputError, InputTypeError: for an unknown word, or a parameter out of its range.
         SpaceError, TagError: as ``VonMises``.
     """
-
-    has_slopes = False
 
     def __init__(
         self,
@@ -184,10 +186,7 @@ class FinitePlasticity(VonMises):
         with timed("return mapping"):
             varying = VARYING[self.kind]
             with np.errstate(over="ignore", invalid="ignore"):
-                values = self._points.evaluate(self._strain)
-                gradient = np.zeros((len(values), 3, 3))
-                gradient[:, varying[0], varying[1]] = values
-                flowed = self._return(gradient, *self._committed())
+                flowed = self._return(self._gradients(), *self._committed())
                 logarithm = self._volume_changes() @ self._spread.T
                 stress = flowed.stress.copy()
                 stress[:, :3] += (self._bulk[:, None] * logarithm).reshape(-1, 1)
@@ -198,6 +197,27 @@ class FinitePlasticity(VonMises):
             self._points.write(self._piola, flowed.first_piola)
             self._points.write(self._upper, flowed.tangent[:, rows, columns])
             self._points.write(self.stress, stress)
+
+    def _gradients(self) -> Array:
+        """Gradients of the displacement at the points ``(n, 3, 3)``."""
+        values, varying = self._points.evaluate(self._strain), VARYING[self.kind]
+        gradient = np.zeros((len(values), 3, 3))
+        gradient[:, varying[0], varying[1]] = values
+        return gradient
+
+    def begins_with(self) -> tuple[Any, ...]:
+        """Initial values of the return at the present displacement: gradient, committed history and parameters, in its order."""
+        return self._gradients(), *self._committed(), self._mu, self._curve, VARYING[self.kind]
+
+    @property
+    def stress_in_forms(self) -> fem.Function:
+        """The Function of the stress in ``residual``: the deviator's first Piola-Kirchhoff stress."""
+        return self._piola
+
+    def _slopes_of_return(self) -> tuple[Callable[[Any], Any], Callable[..., ByReturn]]:
+        from uem_dolfinx.materials.logarithmic_slopes import logarithmic_back
+
+        return lambda w: self._components(self._part(w)), logarithmic_back
 
     def _return(self, gradient: Array, plastic_strain: Array, peeq: Array) -> Flowed:
         before, varying = (gradient, plastic_strain, peeq, self._mu), VARYING[self.kind]

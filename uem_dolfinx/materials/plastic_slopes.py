@@ -15,7 +15,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints
-from uem_dolfinx.materials.return_slopes import ByReturn, plane_stress_back, radial_back
+from uem_dolfinx.materials.return_slopes import ByReturn
 from uem_dolfinx.parallel import reduced
 
 
@@ -26,7 +26,8 @@ class PlasticSlopes:
         law: the law, with the initial values ``begins_with`` of its return and its parameters ``handed``.
         points: quadrature points of its stress.
         stress, bulk: Functions of its stress, and of its bulk modulus, in forms.
-        along: returns the strain along a displacement, an expression with the components of ``Returned``.
+        along: returns the strain along a displacement, an expression with the components of the stress.
+        back: derivatives of the return, see ``return_slopes``.
         a: adjoint displacement, a Function.
         test: test function of the displacement.
 
@@ -36,10 +37,9 @@ class PlasticSlopes:
 
     def __init__(
         self, law: Any, points: QuadraturePoints, stress: fem.Function, bulk: fem.Function, along: Callable[[Any], Any],
-        a: fem.Function, test: Any,
+        back: Callable[..., ByReturn], a: fem.Function, test: Any,
     ):  # fmt: skip
-        self.stress, self.bulk, self._law, self._points = stress, bulk, law, points
-        self._back: Callable[..., ByReturn] = plane_stress_back if law.kind == "plane_stress" else radial_back
+        self.stress, self.bulk, self._law, self._points, self._back = stress, bulk, law, points, back
         self._along_a = points.compile(along(a))
         size = stress.function_space.dofmap.index_map_bs
         self._pulled = points.create_function("pulled", size)
@@ -47,7 +47,7 @@ class PlasticSlopes:
         n = points.volumes.size
         self._by_stress = np.zeros((n, size))
         #: Derivatives by plastic strain and peeq at the end of the step, after ``pass_back`` at its beginning; forwards their changes.
-        self._by_history = np.zeros((n, size)), np.zeros(n)
+        self._by_history = np.zeros((n, law.plastic_strain.function_space.dofmap.index_map_bs)), np.zeros(n)
         self._state: tuple[Array, ...] = ()
 
     def begin(self, by_stress: Array | None) -> None:
@@ -124,9 +124,10 @@ class PlasticChanges(PlasticSlopes):
             Changes at the same displacement, of the residual by the stress ``(n,)``, and of ``bulk``.
         """
         self._state = self._law.begins_with()
-        k, n = self._by_stress.shape[1], len(self._by_stress)
-        units = np.broadcast_to(np.eye(2 * k + 1)[:, None], (2 * k + 1, n, 2 * k + 1))
-        self._rows = [self._back(*self._state, unit[:, :k], unit[:, k : 2 * k], unit[:, -1]) for unit in units]
+        n, k = self._by_stress.shape
+        m = k + self._by_history[0].shape[1] + 1
+        units = np.broadcast_to(np.eye(m)[:, None], (m, n, m))
+        self._rows = [self._back(*self._state, unit[:, :k], unit[:, k:-1], unit[:, -1]) for unit in units]
         changes, known = {name: np.zeros(n) for name in self._law.handed}, self._law.parameters
         for name, value in self._law.handed.items():
             for m, change in direction:
@@ -151,10 +152,10 @@ class PlasticChanges(PlasticSlopes):
     def end(self) -> None:
         """End the step, with a, the change of the displacement (collective)."""
         found, k = self._after(self._points.evaluate(self._along_a)), self._by_stress.shape[1]
-        self._by_history = found[:, k : 2 * k], found[:, -1]
+        self._by_history = found[:, k:-1], found[:, -1]
 
     def _after(self, strain: Array) -> Array:
-        """Changes of stress, plastic strain and peeq after the return, with a change of the strain ``(n, 2 k + 1)``."""
+        """Changes of stress, plastic strain and peeq after the return, with a change of the strain, side by side."""
         plastic, peeq = self._by_history
         parts = [(row.strain * strain + row.plastic_strain * plastic).sum(axis=1) + row.peeq * peeq for row in self._rows]
         return np.asarray((np.stack(parts) + self._explicit).T)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.materials.layers import Layers
     from uem_dolfinx.materials.logarithmic import Flowed
     from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
+    from uem_dolfinx.materials.return_slopes import ByReturn
 
 STRAINS = ("small", "green_lagrange")
 #: Expected values of kinematic hardening.
@@ -121,17 +122,16 @@ class VonMises(given.Sealed):
         given.kind("u", u, isinstance(u, fem.Function), "a Function of a vector Lagrange space")
         given.word("kind", kind, KINDS)
         given.word("strain", strain, STRAINS)
-        V = u.function_space
         self.u, self.displacement, self.kind, self.strain = u, displacement, kind, strain
-        self.mesh, self.comm = V.mesh, V.mesh.comm
+        self.mesh, self.comm = u.function_space.mesh, u.function_space.mesh.comm
         degree = self._degree_of(u)
         #: The displacement in UFL.
         self._moved = u if displacement is None else ufl.split(u)[displacement]
         self.cells = owned_cells(self.mesh, cells)
-        degrees = self._degrees(degree, quadrature_degree)
-        self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, degree) for degree in degrees)
-        self._told = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening, "cells": cells}
+        rules = (QuadraturePoints(self.mesh, self.cells, rule) for rule in self._degrees(degree, quadrature_degree))
+        self._points, self._pressure_points = rules
         self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
+        self._told = self.handed | {"cells": cells}
         #: Yield stress over peeq; with a table, the yield curve of the layers.
         self._curve: YieldCurve
         self._layers: Layers | None = None
@@ -371,8 +371,14 @@ class VonMises(given.Sealed):
         """Derivatives through load steps, backwards or ``onward``; arguments as in ``PlasticSlopes`` (collective)."""
         from uem_dolfinx.materials.plastic_slopes import PlasticChanges, PlasticSlopes
 
-        mode = PlasticChanges if onward else PlasticSlopes
-        return mode(self, self._points, self._s, self._kappa, lambda w: self._vector(self._variation(w)), a, test)
+        kind = PlasticChanges if onward else PlasticSlopes
+        return kind(self, self._points, self.stress_in_forms, self._kappa, *self._slopes_of_return(), a, test)
+
+    def _slopes_of_return(self) -> tuple[Callable[[Any], Any], Callable[..., ByReturn]]:
+        """Strain along a displacement, and derivatives of the return."""
+        from uem_dolfinx.materials.return_slopes import plane_stress_back, radial_back
+
+        return lambda w: self._vector(self._variation(w)), plane_stress_back if self.kind == "plane_stress" else radial_back
 
     def _refuse_infinite(self, stress: Array) -> None:
         """NotFiniteError on all ranks if a stress at this rank's points ``(n_points, size)`` is not finite (collective)."""

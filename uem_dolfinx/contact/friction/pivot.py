@@ -13,6 +13,7 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.seam.placement import Kinematics
     from uem_dolfinx.contact.seam.relative_motion import Ties
     from uem_dolfinx.geometry.configuration import Configuration
     from uem_dolfinx.geometry.rigid import Motion
@@ -50,14 +51,19 @@ class LastStep:
     """Data of the last step's end, for contactors that follow other nodes in a mean.
 
     Attributes:
-        ties: weights of followed nodes.
+        kinematics: of the contactors, with the weights of followed nodes.
         x: positions of the owned nodes ``(n_owned, gdim)``.
         motion: of a rigid target; None if it had not moved.
     """
 
-    ties: Ties
+    kinematics: Kinematics
     x: Array
     motion: Motion | None
+
+    @property
+    def ties(self) -> Ties:
+        """Weights of followed nodes."""
+        return self.kinematics.ties
 
     def renewed(self, config: Configuration, discretisation: Any) -> bool:
         """Whether nothing has moved since, so that small sliding may have renewed its rows (collective)."""

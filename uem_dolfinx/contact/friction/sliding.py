@@ -50,6 +50,7 @@ class Sliding:
         pivot: record of the exchanges in the present linearised problem.
         wear: of the contactors; None without wear.
         left_out: tangents whose equations are redundant and were dropped ``(n, gdim - 1)``.
+        last: the last step's end, for contactors that follow other nodes in a mean; None before a placement.
     """
 
     frame: Frame
@@ -77,8 +78,8 @@ class Sliding:
         self._held_by: tuple[Ints, Ints, Array] | None = None
         #: The last slip directions, with the frame and the vectors that they are made of.
         self._directed: tuple[Frame, Array, Array] | None = None
-        self._last: LastStep | None = None
-        self.pivot = Pivot.begin(np.zeros(n), np.zeros((n, g)), np.zeros((n, g)))
+        self.last: LastStep | None = None
+        self.pivot = Pivot.begin(np.zeros(n), *np.zeros((2, n, g)))
         #: The last state and what its limits depend on, and these limits.
         self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 6, (np.zeros(n), np.zeros(n))
 
@@ -98,9 +99,8 @@ class Sliding:
         """Find the anchors, or the relative motions of contactors, in the current configuration (collective)."""
         if self.discretisation.traits.pointwise:
             self._anchors, self._held_by = anchors_of(_of(state), self.discretisation.target, self.config.gdim == 3)
-        elif self._last is None or self._last.renewed(self.config, self.discretisation):
-            here = self.config.x[: self.config.n_owned].copy()
-            self._last = LastStep(kinematics.ties, here, self.discretisation.target.motion)
+        elif self.last is None or self.last.renewed(self.config, self.discretisation):
+            self.last = LastStep(kinematics, self.config.x[: self.config.n_owned].copy(), self.discretisation.target.motion)
         self.limits.grow(kinematics)
         if (value := self._value_now(kinematics)) is not None:
             self.limits.change(value)
@@ -112,14 +112,15 @@ class Sliding:
             way = None if self._held_by is None else Ties.of(self.config, self.nodes, self._held_by, None, True)
             away = self.config.here(self.nodes) - self._anchors
         else:
-            assert self._last is not None
-            way = self._last.ties
-            away = way.relative(self._way_since(self._last))
+            assert self.last is not None
+            way = self.last.ties
+            away = way.relative(self.since(self.last))
         self.frame = Frame.of(kinematics, away, way, self._other_normals, self.discretisation.setting.prescribed)
         if of_rate(self.limits.law):
             self.limits.see(np.linalg.norm(self.frame.slip, axis=1) / kinematics.ties.share)
 
-    def _way_since(self, last: LastStep) -> Array:
+    def since(self, last: LastStep) -> Array:
+        """Displacement of the owned nodes since, of contactors relative to a rigid target ``(n_owned, gdim)``."""
         return way_since(self.config, self.nodes, last.x, last.motion, self.discretisation.target.motion)
 
     def meet(self, kinematics: Kinematics, normals: Array) -> None:
@@ -214,8 +215,7 @@ class Sliding:
         lam, forced = seen.lam, self.frame.forced(away, self._lost)
         by = stick_slip.Seen(lam, self.frame.tangential(tau), self.bound(state, lam), self.frame.along(away), forced)
         turned = replace(_of(state), direction=self.directions(state))
-        forces, lengths = rounding
-        active = self.active(state)
+        (forces, lengths), active = rounding, self.active(state)
         return stick_slip.find_violations(violated, turned, active, by, force_rounding=forces, gap_rounding=lengths)
 
     @property
@@ -404,7 +404,7 @@ class Sliding:
         tau, start, end, taken = self.step(state, committed, kinematics)
         slips = self.slipping(state) if self.wear is None else state.active & ~f.stick
         slipped = f.slipped + np.where(held[:, None], end, np.where(slips[:, None], self.frame.slip / share, 0.0))
-        self._last, worn = None, f.worn if self.wear is None else self._worn(state, committed, kinematics, tau, (start, end))
+        self.last, worn = None, f.worn if self.wear is None else self._worn(state, committed, kinematics, tau, (start, end))
         now = replace(f, tau=tau, direction=self.directions(state), slipped=slipped, work=f.work + taken, worn=worn)
         return replace(state, friction=now)
 
@@ -421,6 +421,10 @@ class Sliding:
             *rubbing.force_times_way(self.frame, kinematics, (committed, state), tau, ways)
         )
 
+    def forget(self) -> None:
+        """Discard the reference of slip."""
+        self.last = None
+
     def step(self, state: PairState, committed: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array, Array]:
         """Friction at a step's end, slips per unit of friction at start and end ``(n, gdim)``, and dissipation ``(n,)`` (collective)."""
         share, held = kinematics.ties.share[:, None], self.frame.cornered[:, None]
@@ -432,17 +436,13 @@ class Sliding:
         tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slopes, end) * share, _of(state).tau)
         return tau, start, end, stick_slip.work(_of(committed).tau, tau, start, end, self.frame.cornered)
 
-    def forget(self) -> None:
-        """Discard the reference of slip."""
-        self._last = None
-
     def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
         """Relative motions since the last step, per unit of friction at its start and at its end ``(n, gdim)`` (collective)."""
         share = kinematics.ties.share[:, None]
-        if self._last is None:
+        if self.last is None:
             return (self.frame.away / share,) * 2
-        now = kinematics.ties.relative(self._way_since(self._last))
-        return self.frame.away / self._last.ties.share[:, None], now / share
+        now = kinematics.ties.relative(self.since(self.last))
+        return self.frame.away / self.last.ties.share[:, None], now / share
 
 
 def _of(state: PairState) -> FrictionState:

@@ -9,6 +9,7 @@ target ends over a facet, what is covered changes, and dual functions with it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -128,33 +129,40 @@ def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: I
     return out.reshape(k, width, width)
 
 
-def turning(
-    elimination: Elimination, rows: WeightedRows, dofs: Indices, frictional: Frictional, weights: Terms
-) -> list[tuple[Ints, Array]]:
-    """Derivatives of friction forces, at constant coefficients for slipping contactors and constant multipliers for others (collective).
+class RowSlopes(NamedTuple):
+    """Derivatives of the directions and sizes of contactors' own rows, by the positions of nodes.
+
+    Attributes:
+        nodes: that some rows depend on or follow, -1 for no node ``(k, c)``.
+        weight: with which the contactor's friction acts on them ``(k, c)``.
+        normal: derivatives of the rows' directions, whose parts along the target count ``(k, c, gdim, gdim)``.
+        longer: relative growth of the force along them, of a unit of ``push`` ``(k, c, gdim)``.
+        whole: of the integral of the dual function times the contactor's own shape function ``(k, c, gdim)``.
+    """
+
+    nodes: Ints
+    weight: Array
+    normal: Array
+    longer: Array
+    whole: Array
+
+
+def row_slopes(elimination: Elimination, rows: WeightedRows, which: Ints, unit: Array, weights: Terms) -> RowSlopes:
+    """How the rows of covered contactors ``which (k,)`` change (collective).
 
     Args:
         elimination: of the contactors.
         rows: equations of all contactors, where they were made.
-        dofs: local nodes of the contactor facets ``(m, nc)``.
-        frictional: the contactors with friction.
+        which: places among the contactors, ascending.
+        unit: multipliers at the facets' nodes, of these contactors, that make the plain rows' 1 ``(m, nc)``.
         weights: weights by which all contactors follow other nodes.
-
-    Returns:
-        Lists of global nodes, -1 for no node ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
     """
-    at, config, (which, normal, tau) = rows.points, elimination.config, (frictional.which, frictional.normal, frictional.tau)
-    n, g, (m, nc) = len(rows.covered), tau.shape[1], dofs.shape
-    assert rows.whole is not None and rows.slope is not None and rows.push is not None and rows.parts is not None
-    whole = rows.whole[which, None]
-    mine = np.zeros((n, 1 + g))
-    # directions and their changes are the same for any force across the target: one that makes the plain row's multiplier 1
-    sharing = rows.sharing[which]
-    mine[which] = np.column_stack([rows.share[which] / (rows.area[which] * sharing), sharing[:, None] * tau / whole])
-    there = config.from_owners(elimination.nodes, mine, dofs.ravel()).reshape(m, nc, 1 + g)
+    at, config, n = rows.points, elimination.config, len(rows.covered)
+    (m, nc), g = unit.shape, at.x.shape[2]
+    assert rows.slope is not None and rows.parts is not None
     # of every contactor: derivatives of its multiplier times its part of the gap's gradient, and of its share of the facets
-    unit = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]
-    grown = np.einsum("mjb,bj->mj", at.duals.C, basis_of(at.shape).T)[:, :, None, None] * unit[:, None]
+    turned = np.einsum("mg,magh->mah", at.planes.normal, at.turning) / at.planes.size[:, None, None]
+    grown = np.einsum("mjb,bj->mj", at.duals.C, basis_of(at.shape).T)[:, :, None, None] * turned[:, None]
     if at.unequal:
         s = at.segments
         stretched = products(s.weight[:, None] * at.b, at.stretching.reshape(len(at.b), nc * g))
@@ -174,7 +182,7 @@ def turning(
         parts.append(terms_of(at.nodes[e], over, np.concatenate([np.zeros((*grown.shape[:3], g * g + g)), grown], axis=3)))
     length = np.linalg.norm(rows.parts, axis=2, keepdims=True)
     outward = rows.parts / np.where(length > 0, length, 1.0)
-    for some, nodes, blocks in own_curvature(at, there[:, :, 0]):
+    for some, nodes, blocks in own_curvature(at, unit):
         own = -blocks.swapaxes(2, 3)
         longer = np.einsum("pjg,pjwgh->pjwh", outward[_places(at.nodes, nodes[:, :nc])][:, some], own)
         columns = [own.reshape(*own.shape[:3], g * g), longer, np.zeros((*longer.shape[:3], g))]
@@ -188,13 +196,50 @@ def turning(
         for part in ((row, weights[0], which), (term, weights[1], config.to_global(elimination.nodes[which])))
     )
     nodes, values = _table(add_up_terms((rows_of_terms, terms, values)), which, n)
-    k, c = nodes.shape
-    gradient, longer, of_whole = np.split(values[:, :, 1:], [g * g, g * g + g], axis=2)
-    along = longer * (frictional.slips / rows.push[which])[:, None, None]
-    across = np.einsum("kg,kcgh->kch", tau, gradient.reshape(k, c, g, g)) / rows.slope[which, None, None]
-    change = np.einsum("kg,kch->kgch", tau, along - of_whole / whole[:, None]) - np.einsum("kg,kch->kgch", normal, across)
-    blocks = np.einsum("ka,kgch->kagch", values[:, :, 0], change).reshape(k, c * g, c * g)
-    return [*handing_on(at, there[:, :, 1:]), (nodes, blocks)]
+    gradient, longer, whole = np.split(values[:, :, 1:], [g * g, g * g + g], axis=2)
+    normal = gradient.reshape(*nodes.shape, g, g) / rows.slope[which, None, None, None]
+    return RowSlopes(nodes, values[:, :, 0], normal, longer, whole)
+
+
+def turning(
+    elimination: Elimination, rows: WeightedRows, dofs: Indices, frictional: Frictional, weights: Terms
+) -> list[tuple[Ints, Array]]:
+    """Derivatives of friction forces, at constant coefficients for slipping contactors and constant multipliers for others (collective).
+
+    Args:
+        elimination: of the contactors.
+        rows: equations of all contactors, where they were made.
+        dofs: local nodes of the contactor facets ``(m, nc)``.
+        frictional: the contactors with friction.
+        weights: weights by which all contactors follow other nodes.
+
+    Returns:
+        Lists of global nodes, -1 for no node ``(k, c)``, and blocks ``(k, c gdim, c gdim)``.
+    """
+    which, normal, tau = frictional.which, frictional.normal, frictional.tau
+    assert rows.push is not None
+    there, whole = at_facets(elimination, rows, dofs, which, tau)
+    made = row_slopes(elimination, rows, which, there[:, :, 0], weights)
+    (k, c), g = made.nodes.shape, tau.shape[1]
+    along = made.longer * (frictional.slips / rows.push[which])[:, None, None]
+    across = np.einsum("kg,kcgh->kch", tau, made.normal)
+    change = np.einsum("kg,kch->kgch", tau, along - made.whole / whole[:, None]) - np.einsum("kg,kch->kgch", normal, across)
+    blocks = np.einsum("ka,kgch->kagch", made.weight, change).reshape(k, c * g, c * g)
+    return [*handing_on(rows.points, there[:, :, 1:]), (made.nodes, blocks)]
+
+
+def at_facets(elimination: Elimination, rows: WeightedRows, dofs: Indices, which: Ints, tau: Array) -> tuple[Array, Array]:
+    """Multipliers that make plain rows' 1, and tractions, of contactors ``which (k,)`` at facets' nodes ``dofs (m, nc)`` (collective).
+
+    Returns:
+        Both, ``(m, nc, 1 + gdim)``, and the divisors of the weights ``(k, 1)``.
+    """
+    assert rows.whole is not None
+    n, g, whole = len(rows.covered), tau.shape[1], rows.whole[which, None]
+    mine, sharing = np.zeros((n, 1 + g)), rows.sharing[which]
+    # directions and their changes are the same for any force across the target: one that makes the plain row's multiplier 1
+    mine[which] = np.column_stack([rows.share[which] / (rows.area[which] * sharing), sharing[:, None] * tau / whole])
+    return elimination.config.from_owners(elimination.nodes, mine, dofs.ravel()).reshape(*dofs.shape, 1 + g), whole
 
 
 def _places(facets: Ints, which: Ints) -> Ints:
