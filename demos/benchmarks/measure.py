@@ -257,5 +257,5 @@ def machine() -> dict[str, str]:
 def linear_work(history: list, set_ups: int, iterative: bool) -> float:
     """Iterations of an iterative solver; factorisations of a direct one, of which solves by one that is kept are a part each."""
     solves = sum(i.linear_iterations for i in history)
-    # after so many solves by an old factorisation a new one is made, which takes about as long
+    # as many solves by an old factorisation take as long as a new one in small problems, and no longer in others
     return float(solves) if iterative else set_ups + (solves - set_ups) / MOST_SOLVES

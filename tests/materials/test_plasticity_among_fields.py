@@ -92,7 +92,7 @@ class Pressed:
 def test_a_field_that_is_not_coupled_changes_nothing(law, displacement, monkeypatch):
     """Displacement, stress, history and iterations are those of the displacement alone."""
     # an earlier factorisation, which mixed problems do not keep, would leave a part of the right-hand side
-    monkeypatch.setattr(kept_factor, "FEW_CHANGES", -1)
+    monkeypatch.setattr(kept_factor, "OF_CHANGES", np.nan)
     alone, among = Pressed(law), Pressed(law, displacement)
     steps = [[step.newton_iterations for step in run(one.problem, 2)] for one in (alone, among)]
     assert steps[0] == steps[1]

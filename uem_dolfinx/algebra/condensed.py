@@ -61,7 +61,7 @@ class Condensed:
     def __init__(self, space: Nodes):
         self.space = space
         #: K, and the cost of its factorisation that MUMPS estimates from its sparsity pattern.
-        self._expected: tuple[PETSc.Mat, mumps.Expected] | None = None
+        self._expected: tuple[PETSc.Mat, mumps.Cost] | None = None
         self.drop()
 
     #: Preconditioner that solves with K_II.

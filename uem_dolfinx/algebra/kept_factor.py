@@ -2,7 +2,8 @@
 
 While contactors slide, P and the curvature of the contact change little and near the contact only, and so does the tangent of bodies
 whose strains hardly change. A Krylov method preconditioned by the old factorisation takes a few solves; a new factorisation takes as long
-as about ten. The constrained matrix is not assembled. ``Q'KP`` with Q different from P has the factorisation of another such matrix.
+as ten, in 3D as up to a hundred. The constrained matrix is not assembled. ``Q'KP`` with Q different from P has the factorisation of
+another such matrix.
 
 The determinants of both matrices have the same sign if none of the real eigenvalues of ``Q'KP`` times the old inverse is negative. The
 Krylov method approximates those that are far from one; a factorisation that leaves a negative one does not serve.
@@ -16,18 +17,22 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
+from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
 
-#: A factorisation that has not done after so many solves is made anew, which takes about as long.
+#: A factorisation that has not done after so many solves is made anew, unless its counted cost allows more.
 #: [convention; solves; test_kept_factor.py::test_a_factor_that_does_not_serve]
 MOST_SOLVES = 8
-#: Solves with a factorisation in which so many unknowns more, or fewer, are used than in the matrix it serves take some more.
-#: [convention; unknowns; test_kept_factor.py::test_a_factor_serves_few_changes]
-FEW_CHANGES = 4
+#: A solve takes as long, for every entry of L and U, as so many operations of the factorisation: it waits for memory.
+#: [convention; operations; test_kept_factor.py::test_a_factor_may_take_as_long_as_another]
+OF_AN_ENTRY = 20
+#: Unknowns that are used more, or fewer, than in the factorised matrix take so many times the root of their number of solves.
+#: [convention; solves; test_kept_factor.py::test_a_factor_serves_few_changes]
+OF_CHANGES = 4.0
 #: A factorisation serves for bodies whose stiffness has changed by no more than this part anywhere.
 #: [convention; diagonal of K; test_kept_factor.py::test_a_factor_serves_few_changes]
 ALIKE = 0.02
@@ -47,6 +52,7 @@ class KeptFactor:
     def __init__(self, space: Nodes):
         self.space = space
         self._pc: Any = None
+        self._most = MOST_SOLVES
         #: Mask of the used columns of P, the diagonal of K, and whether Q is P.
         self._made_with: Any = None
 
@@ -54,7 +60,7 @@ class KeptFactor:
         """Keep a new factorisation; not in mixed problems, where one tolerance does not fit residuals with different units."""
         if self.space.mixed:
             return
-        self._pc, self._made_with = pc, (P.used, K.getDiagonal(), Q is P)
+        self._pc, self._made_with, self._most = pc, (P.used, K.getDiagonal(), Q is P), most_solves(pc)
 
     def drop(self) -> None:
         """Drop the factorisation, so that the next matrix is factorised."""
@@ -68,7 +74,7 @@ class KeptFactor:
             there = diagonal.array_r
             if alike == (Q is P) and (np.abs(K.getDiagonal().array_r - there) <= ALIKE * np.abs(there)).all():
                 changed = float(np.count_nonzero(used != P.used))
-        return bool(reduced(self.space.comm, changed) <= FEW_CHANGES)
+        return bool(OF_CHANGES * np.sqrt(reduced(self.space.comm, changed)) <= self._most)
 
     def solve(
         self, P: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None, Q: Restriction, rhs: PETSc.Vec, accuracy: float
@@ -81,8 +87,8 @@ class KeptFactor:
         ksp.setOperators(A)
         ksp.setType("fgmres")
         ksp.setComputeEigenvalues(Q is not P)
-        ksp.setGMRESRestart(MOST_SOLVES)
-        ksp.setTolerances(rtol=min(accuracy, LEAST_ACCURATE), max_it=MOST_SOLVES)
+        ksp.setGMRESRestart(self._most)
+        ksp.setTolerances(rtol=min(accuracy, LEAST_ACCURATE), max_it=self._most)
         pc = ksp.getPC()
         pc.setType("python")
         pc.setPythonContext(_Solves(self._pc, ~P.used.ravel()))
@@ -98,6 +104,16 @@ class KeptFactor:
         ksp.destroy()
         A.destroy()
         return found
+
+
+def most_solves(pc: PETSc.PC) -> int:
+    """Number of solves that take as long as the factorisation, by MUMPS' counts of both; for other packages ``MOST_SOLVES``."""
+    cost = mumps.made(pc)
+    if cost is None:
+        return MOST_SOLVES
+    # symmetric factors are L alone, which a solve reads twice
+    entries = cost.entries * (2 if pc.getType() == "cholesky" else 1)
+    return max(MOST_SOLVES, int(cost.flops / (OF_AN_ENTRY * max(entries, 1.0))))
 
 
 class _United:

@@ -2,9 +2,9 @@
 
 Parameters as in its users' guide: INFOG(1) is the status of a factorisation, ICNTL(14) the workspace beyond the estimate of the analysis,
 INFOG(12) the number of negative pivots of a symmetric factorisation. ICNTL(7) and INFOG(7) are the requested and the used ordering.
-ICNTL(33) enables the determinant, RINFOG(12) is its mantissa. RINFOG(1) and INFOG(20) are the estimated operations and entries, the
-latter in millions if negative. With a Schur complement all refer to the eliminated block, and with ICNTL(26) = 0 so do solves. petsc4py
-has neither Schur complements nor separate analyses, so that PETSc's library is called directly.
+ICNTL(33) enables the determinant, RINFOG(12) is its mantissa. RINFOG(1) and INFOG(20) are the estimated operations and entries, RINFOG(3)
+and INFOG(29) the actual ones, entries in millions if negative. With a Schur complement all refer to the eliminated block, and with
+ICNTL(26) = 0 so do solves. petsc4py has neither Schur complements nor separate analyses, so that PETSc's library is called directly.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ def solves_with_schur_complement(comm: MPI.Comm) -> bool:
     return comm.size == 1 or PETSc.Sys.getVersion() < (3, 19)
 
 
-class Expected(NamedTuple):
-    """Estimated cost of a factorisation.
+class Cost(NamedTuple):
+    """Cost of a factorisation.
 
     Attributes:
         flops: floating-point operations.
@@ -109,8 +109,21 @@ class Expected(NamedTuple):
     flops: float
     entries: float
 
+    @classmethod
+    def counted(cls, flops: float, entries: int) -> Cost:
+        """From MUMPS' counts."""
+        return cls(flops, float(entries if entries >= 0 else -1e6 * entries))
 
-def expected(pc: PETSc.PC, A: PETSc.Mat) -> Expected:
+
+def made(pc: PETSc.PC) -> Cost | None:
+    """Cost of a factorisation that has been made; None for other packages."""
+    if not solves(pc):
+        return None
+    factors = pc.getFactorMatrix()
+    return Cost.counted(factors.getMumpsRinfog(3), factors.getMumpsInfog(29))
+
+
+def expected(pc: PETSc.PC, A: PETSc.Mat) -> Cost:
     """Estimated cost of factorising a matrix with the options of a PC, from the matrix's pattern (collective)."""
     library, alone = _petsc(), PETSc.PC().create(pc.comm)
     alone.setOptionsPrefix(pc.getOptionsPrefix())
@@ -124,9 +137,9 @@ def expected(pc: PETSc.PC, A: PETSc.Mat) -> Expected:
         _check(library.MatCholeskyFactorSymbolic(factors.handle, A.handle, None, info))
     else:
         _check(library.MatLUFactorSymbolic(factors.handle, A.handle, None, None, info))
-    flops, entries = factors.getMumpsRinfog(1), factors.getMumpsInfog(20)
+    found = Cost.counted(factors.getMumpsRinfog(1), factors.getMumpsInfog(20))
     alone.destroy()
-    return Expected(flops, float(entries if entries >= 0 else -1e6 * entries))
+    return found
 
 
 def _factors(pc: PETSc.PC) -> PETSc.Mat:
