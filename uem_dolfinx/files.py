@@ -82,6 +82,14 @@ def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
     return Path(value)
 
 
+def given_resume(resume: Any, comm: MPI.Comm) -> bool:
+    """True or False, the same on all ranks; InputTypeError or InputError for anything else (collective)."""
+    with agreed(comm):
+        resume = given.flag("resume", resume)
+    given.alike(comm, "files", resume=resume)
+    return bool(resume)
+
+
 def on_rank_0(comm: MPI.Comm, what: str, action: Callable[[], T]) -> T:
     """Call a function that uses files on rank 0, and send its result or error to all ranks (collective).
 

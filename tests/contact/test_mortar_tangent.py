@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import CELLS
+from helpers import CELLS, slow
 from mortar_scenes import Blocks, disturbed
 
 import uem_dolfinx as uem
@@ -79,16 +79,15 @@ def leaning(b, cell):
         disturbed(b, 2, 0.01)
 
 
-def weighted_gap(cell, target, offset=0.0, hollow=None):
+def weighted_gap(cell, target, offset=0.0, hollow=None, degree=1):
     """Of leaning blocks above a mesh, one that ends over a facet, or a rigid ball; of rings with a radius ``hollow``; with an offset."""
-    b = Blocks(cell, (3, 5), gap=0.02, comm=MPI.COMM_SELF, narrow=0.55 if target == "end" else 1.0, hollow=hollow, contactor=(
-        "lower" if target == "end" else "upper"
-    ))  # fmt: skip
+    how = {"narrow": 0.55 if target == "end" else 1.0, "contactor": "lower" if target == "end" else "upper"}
+    b = Blocks(cell, (3, 5), degree=degree, gap=0.02, comm=MPI.COMM_SELF, hollow=hollow, **how)
     if target == "ball":
         b.contact = uem.Contact(b.high, uem.RigidSphere([0.4 + (hollow or 0.0)] * (b.g - 1) + [-2.0], 2.0), coupling="mortar")
     b.contact.offset = offset
     problem = b.pressed()
-    leaning(b, cell)
+    leaning(b, cell if degree == 1 else "hexahedron")
     return WeightedGap(b, problem.system)
 
 
@@ -128,6 +127,23 @@ def test_curvature_against_differences(cell, target, offset):
             index = (nodes[:, :, None] * phi.g + np.arange(phi.g)).reshape(len(nodes), -1)
             np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
         assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
+
+
+@pytest.mark.parametrize("cell", [slow("tetrahedron"), "hexahedron"])
+def test_middles_of_the_sides_at_ends(cell):
+    """Rows and curvature by motions of the nodes in the middles of quadratic target facets and of their sides, which move no chord."""
+    phi = weighted_gap(cell, "end", degree=2)
+    rows, rng = phi.leave_out("end"), np.random.default_rng(3)
+    first, parts = phi.forces(phi.start), curvature(rows.points, phi.pressure)
+    corner = (np.abs(phi.X[:, None] - phi.b.scene.mesh.geometry.x).max(axis=2) < 1e-9).any(axis=1)
+    way, h = (rng.standard_normal(phi.X.shape) * (~corner & (phi.X[:, 2] > 1e-9))[:, None]).ravel(), 1e-6
+    ahead, behind = phi.start + h * way, phi.start - h * way
+    assert (phi.value(ahead) - phi.value(behind)) / (2 * h) == pytest.approx(first @ way, rel=1e-6)
+    measured, told = -(phi.forces(ahead) - phi.forces(behind)) / (2 * h), np.zeros(len(way))
+    for nodes, blocks in parts:
+        index = (nodes[:, :, None] * 3 + np.arange(3)).reshape(len(nodes), -1)
+        np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
+    assert np.abs(measured - told).max() < 1e-6 * np.abs(measured).max()
 
 
 @pytest.mark.parametrize("cell,target,offset", SCENES)

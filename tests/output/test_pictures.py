@@ -10,6 +10,7 @@ import subprocess
 import sys
 import traceback
 import types
+from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
@@ -178,6 +179,12 @@ def test_arguments_of_other_dimensions(monkeypatch, folder):
         "field": [],
     }.items():
         refused(uem.InputError, name, lambda name=name, value=value: uem.plot_scene(flat, folder / "a.png", **{name: value}))
+    for name in ("mirror", "cells", "arrows", "rigid", "triad"):
+        draw = partial(uem.plot_scene, flat, folder / "a.png", **{name: "no"})
+        refused(uem.InputTypeError, (f"{name} = 'no'", "True or False"), draw)
+    refused(
+        uem.InputTypeError, ("mirror = 1", "True or False"), lambda: uem.plot_pressure(flat.contacts, folder / "a.png", mirror=1)
+    )
 
 
 def test_no_pyvista_is_a_named_error_on_every_rank(monkeypatch, folder):

@@ -32,10 +32,13 @@ def test_a_field_of_the_problems_own_name(name, folder):
     )
 
 
-def test_a_section_is_not_switched():
+def test_steps_switch_contacts():
     b = blocks(COMM, "triangle")
-    bolt = uem.Preload(b.high, b.low, force=1.0)
+    bolt, contact = uem.Preload(b.high, b.low, force=1.0), uem.Contact(b.high, b.low)
     raised(uem.InputError, "cannot be switched", lambda: bolt.switch(False))
+    raised(
+        uem.InputError, r"is switched by a step: expected Step\(..., contacts=\{contact: False\}\)", lambda: contact.switch(False)
+    )
 
 
 @pytest.mark.parametrize("kind", [GeneratorExit, StopIteration])

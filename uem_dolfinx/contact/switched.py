@@ -42,7 +42,7 @@ def switch_off(pair: Interface) -> None:
 
 def mark(contact: Contact, on: bool) -> None:
     """Mark a contact as switched on or off, also among others in its interface (collective)."""
-    contact.switch(on)
+    contact.note_on(on)
     whole = contact.pair.whole
     if len(whole.members) > 1:
         every = whole.discretisation.setting.on.copy()

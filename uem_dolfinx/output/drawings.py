@@ -50,6 +50,9 @@ class Drawing:
         field = next((one for one in problem.declared if field is not None and field is one._fields.get("pressure")), field)
         gdim, pressed = problem.config.gdim, isinstance(field, Contact | GeneralContact)
         with agreed(problem.comm):
+            for what, flag in (("mirror", mirror), ("cells", cells), ("arrows", arrows), ("rigid", rigid), ("triad", triad)):
+                if flag is not None:
+                    given.flag(what, flag)
             for name, value in ({"mirror": mirror} if gdim == 3 else {"surface": surface}).items():
                 _refuse_of_other_dimension(gdim, name, value)
             if np.ndim(levels) == 0:

@@ -14,6 +14,7 @@ from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.errors import SpaceError
+from uem_dolfinx.files import given_resume
 from uem_dolfinx.form_checks import check_functional, check_linear
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.log import logger
@@ -105,7 +106,7 @@ class EnergyBook(Closing, given.Sealed):
         self._contacts = [contact for contact in problem.contacts if not contact.is_further_part]
         suffixes = contact_suffixes(self._contacts)
         columns = [*names, *(f"momentum_{a}" for a in axes), *(f"impulse_{a}{s}" for s in suffixes for a in axes)]
-        resume_at = self.dynamics if resume else None
+        resume_at = self.dynamics if given_resume(resume, problem.comm) else None
         self.table = None if path is None else CsvTable(path, problem.comm, columns, resume_at, whose="an EnergyBook")
         begin = {} if self.table is None else self.table.last
         self._works = np.array([begin.get(name, 0.0) for name in ("damped", "external", "contact")])

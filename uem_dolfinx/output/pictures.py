@@ -334,7 +334,7 @@ def plot_pressure(
     if not pairs:
         raise InputError(given.sentence("contacts", contacts, "a contact or several"))
     with agreed(pairs[0].config.comm):
-        shown = checked_window(1, window)
+        shown, mirror = checked_window(1, window), given.flag("mirror", mirror)
     found = [gather_contactors(contact, 0.0) for contact in pairs]
     file = BytesIO()
     with panel_of(file if picture is ... else picture, pairs[0].config.comm) as ax:

@@ -15,7 +15,7 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.files import aside, given_path, in_use, keep_aside, on_rank_0
+from uem_dolfinx.files import aside, given_path, given_resume, in_use, keep_aside, on_rank_0
 from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.output.columns import Columns
@@ -73,7 +73,7 @@ class HistoryWriter(Closing, given.Sealed):
         resume: bool = False,
     ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
-        until = problem.progress if resume else None
+        until = problem.progress if given_resume(resume, problem.comm) else None
         self.problem, dynamics = problem, problem.dynamics
         axes, turns = list("xyz")[: problem.config.gdim], list("xyz") if problem.config.gdim == 3 else ["z"]
         names = ["factor" if dynamics is None else "time", "step", "newton_iterations"]
@@ -198,7 +198,8 @@ class ResultsWriter(Closing, given.Sealed):
     ):
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         self.problem, comm, mesh = problem, problem.comm, problem.config.mesh
-        self.path = self._stem = given_path("path", path, comm)
+        self.path, resume = given_path("path", path, comm), given_resume(resume, comm)
+        self._stem = self.path
         with agreed(comm):
             _check_fields(fields, mesh)
             vtx = None if vtx is None else given.flag("vtx", vtx)

@@ -15,7 +15,7 @@ The position of the target's boundary on the contactor facet, the gap there, c a
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -130,7 +130,9 @@ class _Ends:
         n, size = at.planes.normal[e], at.planes.size[e]
         press, h, with_b, _ = self._factors(e, s)
         v, grown = -s.way, s.motions.of_area(n / size[:, None])
-        rise = s.motions.along(s.t - n) + 2 * s.gap[:, None, None] * grown
+        # gaps change by the motion of the target's point there, and its side moves as the chord does
+        there = replace(s.motions, N=s.N, part=s.gap / size)
+        rise = 2 * there.along(s.t) - s.motions.along(s.t + n) + 2 * s.gap[:, None, None] * grown
         # points on the contactor facet, and derivatives of the functions there
         tab = at.shape.tabulate(s.xi)
         over = dual_tangents(tangents(tab, at.x[e]), n)

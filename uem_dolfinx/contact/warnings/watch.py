@@ -13,7 +13,7 @@ from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.both_sides import OfBothSides
 from uem_dolfinx.contact.pair.tables import contacts_with
 from uem_dolfinx.contact.warnings.checks import sagging, warn_of_sagging_facets, warn_of_slipped
-from uem_dolfinx.errors import OrientationError, UEMError
+from uem_dolfinx.errors import InputError, OrientationError, UEMError
 from uem_dolfinx.geometry.facets import facets_of
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
@@ -82,7 +82,11 @@ class WatchedContact(OfBothSides):
         return self._on
 
     def switch(self, on: bool) -> None:
-        """Mark the contact as switched on or off; the caller changes its pair."""
+        """Raise InputError: a ``Step`` switches contacts, with their forces."""
+        raise InputError(f"contact '{self.name}' is switched by a step: expected Step(..., contacts={{contact: {on!r}}})")
+
+    def note_on(self, on: bool) -> None:
+        """Note that a step has switched the contact on or off."""
         self._on = on
 
     @property
