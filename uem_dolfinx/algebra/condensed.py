@@ -26,6 +26,7 @@ from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix
 from uem_dolfinx.algebra.entries import SYMMETRIC, stiffen
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.algebra.returning import Returning
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
@@ -49,7 +50,7 @@ class Solved:
         self.du, self.negative, self.indefinite = du, negative, indefinite
 
 
-class Condensed:
+class Condensed(Returning):
     """The factorisation of one K without the components of the contact, and the last constrained problem that uses it.
 
     Not for mixed problems: with those components fixed, an incompressible body may be enclosed, and its matrix singular.
@@ -64,16 +65,15 @@ class Condensed:
         self._expected: tuple[PETSc.Mat, mumps.Cost] | None = None
         self.drop()
 
-    #: Preconditioner that solves with K_II.
-    _pc: Any = None
+    made, stays = "_pc", ("beside",)
     #: Mask of owned nodes ``(n_owned,)`` that may be followed next, from the mask of followed nodes ``(n_owned,)`` (collective), or None.
     beside: Callable[[Bools], Bools] | None = None
 
     def drop(self) -> None:
         """Forget K (collective)."""
-        if self._pc is not None:
-            # garbage would keep the factors until the next iteration
-            self._pc.destroy()
+        self.lose()
+        #: Preconditioner that solves with K_II.
+        self._pc: Any = None
         #: K, the state of its values, and the components without Dirichlet condition.
         self._made_for: tuple[PETSc.Mat, int, Bools] | None = None
         #: Whether a step begins: its C must not depend on contacts of earlier steps.
@@ -85,7 +85,6 @@ class Condensed:
         self._wide = False
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
-        self._pc = None
         self._St: Any = None
         self._negative_inside = self._indefinite_inside = False
         #: P, Q, K and G of the constrained problem, and on rank 0 its dense matrix.

@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.restriction import Restriction
+from uem_dolfinx.algebra.returning import Returning
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
@@ -42,7 +43,7 @@ ALIKE = 0.02
 LEAST_ACCURATE = 1e-3
 
 
-class KeptFactor:
+class KeptFactor(Returning):
     """The last factorisation of ``Q'KP``, with data of its matrix.
 
     Args:

@@ -7,6 +7,7 @@ from math import ceil
 import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.returning import Returning
 from uem_dolfinx.arrays import Array
 
 #: A preconditioner is kept for matrices that differ from its own in no more than this part of the equations.
@@ -17,7 +18,7 @@ KEPT_CHANGES = 0.1
 KEPT_SLOWER = 2.0
 
 
-class KeptPreconditioner:
+class KeptPreconditioner(Returning):
     """Equations that a preconditioner was made with, and its iterations per digit.
 
     Attributes:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx import compat, forms, given
+from uem_dolfinx import forms, given
 from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.condensed import Condensed, Solved
 from uem_dolfinx.algebra.deflation import MULTIGRID, in_deflation, near_null_space, pressed_hard
 from uem_dolfinx.algebra.entries import is_symmetric, rows_are_symmetric, stiffen
 from uem_dolfinx.algebra.kept_factor import KeptFactor
-from uem_dolfinx.algebra.kept_preconditioner import KeptPreconditioner
-from uem_dolfinx.algebra.options import GMRES_RESTART, NO_SUCH_TYPE, check_options, last_words, options_in_turn, tell_unused
+from uem_dolfinx.algebra.ksp import KspOfOptions
+from uem_dolfinx.algebra.options import NO_SUCH_TYPE, check_options, last_words, options_in_turn, tell_unused
 from uem_dolfinx.algebra.products import UnitedMatrix, made_of
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import InputError, LinearSolveError
@@ -27,15 +25,15 @@ from uem_dolfinx.parallel import agreed, reduced
 #: An iterative solve leaves at least this part of its right-hand side: what is below comes near to rounding.
 #: [convention; ratio of norms; test_linear_solver.py::test_accuracy_of_an_iterative_solve]
 MOST_ACCURATE = 1e-10
-#: Replacements for types of KSP and PC that need symmetric matrices.
-UNSYMMETRIC = {"cg": "gmres", "minres": "gmres", "cholesky": "lu", "icc": "ilu"}
 
 
-class UnitedSolver:
+class UnitedSolver(KspOfOptions):
     """KSP for ``P'KP dq = P'(r - K c)``.
 
     PETSc's ``options`` are given without ``prefix``; defaults depend on the size. Without ``ksp_rtol`` the tolerance follows Newton.
     """
+
+    parts = "_kept", "_preconditioner", "condensed"
 
     def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
         self.space = space
@@ -71,42 +69,33 @@ class UnitedSolver:
         self._factor_of: tuple[Restriction, PETSc.Mat, Restriction] | None = None
         #: Whether Q is not P, and whether a step begins.
         self._petrov_galerkin = self._begins = False
-
-    def _create_ksp(self) -> PETSc.KSP:
-        ksp = PETSc.KSP().create(self.space.comm)
-        #: The preconditioner of the options, which the KSP may use within a deflated one.
-        self.pc = ksp.getPC()
-        ksp.setOptionsPrefix(self._prefix)
-        ksp.setErrorIfNotConverged(False)
-        ksp.setConvergenceHistory(reset=True)
-        with self._in_database():
-            try:
-                ksp.setFromOptions()
-            except PETSc.Error as error:
-                raise InputError(
-                    f"PETSc refuses petsc_options = {given.shown(self.options)}: {last_words(error)}; correct them"
-                ) from error
-        return ksp
-
-    def _use(self, options: dict[str, Any]) -> None:
-        """Make a new KSP with these options (collective)."""
-        self.options = options
-        if self.ksp is not None:
-            self.ksp.destroy()
-        #: Whether the preconditioner has to be set up for the present matrix; what it was made for.
-        self._new, self._preconditioner = True, KeptPreconditioner()
-        self.ksp = self._create_ksp()
-        #: Whether the KSP is for symmetric matrices, and the types of KSP and PC in the options.
-        self._symmetric = True
-        self._types = self.ksp.getType(), self.pc.getType()
+        self.commit()
 
     def forget(self) -> None:
         """Drop the constrained matrix, factorisations and the set-up of the preconditioner (collective)."""
-        self._A = self._crossed = self._served = self._factor_of = self._of = self._made_of = self._arguments = None
+        self._served = self._factor_of = self._of = self._made_of = self._arguments = None
         self._kept.drop()
         self.condensed.drop()
-        self._use(self._first)
+        self._make_anew(self._first)
+
+    def _make_anew(self, options: dict[str, Any]) -> None:
+        """Make KSP and constrained matrices anew, with these options (collective)."""
+        self._A = self._crossed = None
+        self._use(options)
         self._united, self._unsymmetric = (UnitedMatrix(self.space, not self.iterative) for _ in range(2))
+
+    def restore(self) -> None:
+        """Return to the last accepted step; a constrained matrix that has been overwritten since then is made again (collective)."""
+        assert self._last is not None
+        own, of, now = self.keeps, self._made_of, {name: self.__dict__[name] for name in ("_symmetric", "_types")}
+        anew = self._united is not self._last["_united"]
+        super().restore()
+        symmetric = self._symmetric
+        if own:
+            self.__dict__.update(now)
+            self._adapt(symmetric)
+        if not (anew or (own and of == self._made_of)):
+            self._made_of = None
 
     def begin_step(self) -> None:
         """Let sparsity and method of solution depend on this step only, but for preconditioners made of a constant K."""
@@ -115,25 +104,6 @@ class UnitedSolver:
             made.drop()
         for part in (self.condensed, self._united, self._unsymmetric):
             part.begin_step()
-
-    @contextmanager
-    def _in_database(self, **instead: Any) -> Iterator[None]:
-        """Put the options into PETSc's database, some with other values; levels of a multigrid read theirs during set-up."""
-        database, prefix, options = PETSc.Options(), self._prefix, self.options | instead
-        for key, value in options.items():
-            database[prefix + key] = value
-        try:
-            yield
-        finally:
-            for key in options:
-                if self._unused and compat.petsc_option_used(prefix + key) is not False:
-                    self._unused.discard(key)
-                del database[prefix + key]
-
-    @property
-    def iterative(self) -> bool:
-        """Whether solves have a tolerance."""
-        return bool(self.ksp.getType() != "preonly")
 
     @property
     def cheap(self) -> bool:
@@ -175,6 +145,8 @@ class UnitedSolver:
             return
         self._factor_of = None
         self._kept.drop()
+        if self.keeps and self.lasting and not self.iterative:
+            self._make_anew(self.options)
         if self._petrov_galerkin:
             if self.iterative:  # P'KP makes the preconditioner
                 self._set_symmetric(restriction, K, G)
@@ -210,6 +182,10 @@ class UnitedSolver:
         symmetric = not unsymmetric
         self._adapt(symmetric)
         self._new = not (self.iterative and self._preconditioner.serves(restriction.equations, *changes))
+        if self._new and self.iterative and self.keeps:
+            self._use(self.options)
+            self._adapt(symmetric)
+            self._preconditioner.serves(restriction.equations, *changes)
         self.pc.setReusePreconditioner(not self._new)
         self._A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         if self._new and self.needs_near_null_space:
@@ -267,30 +243,6 @@ class UnitedSolver:
     def _deflates(self) -> bool:
         """Whether the preconditioner needs deflation of targets under much stiffer contactors."""
         return self.pc.getType() in MULTIGRID and not self.space.mixed
-
-    def _adapt(self, symmetric: bool) -> None:
-        """Use the KSP and PC of the options, or their replacements for unsymmetric matrices."""
-        if symmetric == self._symmetric:
-            return
-        self._symmetric = symmetric
-        pc, before = self.pc, self.pc.getType()
-        self._types = self._types if symmetric else (self.ksp.getType(), before)
-        ksp_type, pc_type = self._types if symmetric else (UNSYMMETRIC.get(kind, kind) for kind in self._types)
-        self.ksp.setType(ksp_type)
-        if ksp_type != self._types[0] or symmetric:
-            # GMRES measures true residuals, without preconditioner: P'KP is nearly singular if all contactors slip
-            self.ksp.setPCSide(PETSc.PC.Side.LEFT if symmetric else PETSc.PC.Side.RIGHT)
-        pc.setType(pc_type)
-        # a new PC reads its own options; an unchanged PC must not read them again, because hypre would lose its set-up
-        reader = pc
-        if pc.getType() == before:
-            reader = PETSc.PC().create(self.space.comm)
-            reader.setType("none")
-        self.ksp.setPC(reader)
-        few = {"ksp_max_it": GMRES_RESTART} if self._at_need and not symmetric and self.iterative else {}
-        with self._in_database(ksp_type=self.ksp.getType(), pc_type=reader.getType(), **few):
-            self.ksp.setFromOptions()
-        self.ksp.setPC(pc)
 
     def _set_unsymmetric(self, P: Restriction, Q: Restriction, K: PETSc.Mat, curvature: PETSc.Mat | None) -> None:
         """Set ``Q'(K + curvature)P`` as operator of the KSP (collective)."""

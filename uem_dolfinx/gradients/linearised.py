@@ -195,10 +195,7 @@ class Linearised:
             )  # fmt: skip
 
     def __exit__(self, *error: object) -> None:
-        solver = self.problem.solver
-        # the hierarchy is rebuilt, since steps must not depend on whether a gradient was computed
-        if solver.iterative or not solver.lasting or self._turns_back:
-            self.problem.system.forget()
+        # steps must not depend on whether a gradient was computed
         self.problem.restore()
 
     def pressures(self, contact: Contact) -> PressureSlopes:

@@ -44,6 +44,7 @@ def state_of(problem: Any) -> State:
         known = problem.bodies.to_checkpoint(stiffness)
         # the multigrid hierarchy is rebuilt, as in a run restarted from the file
         problem.system.forget()
+        problem.solver.commit()
         state.numbers |= {"largest forces": np.asarray(problem.largest_forces).tolist(), "stiffness known": known}
         state.numbers |= problem.progress.to_checkpoint(ramped)
         if ramped:

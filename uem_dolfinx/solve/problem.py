@@ -390,9 +390,9 @@ class UnitedProblem(given.Sealed):
             self.history.note(self._before, self.led[2])
         pairs, self.committed = self.interfaces, np.array(self.u.x.array)
         self.largest_forces = np.maximum(self.largest_forces, self.bodies.remembered(bool(self.pairs)))
-        self.bodies.commit()
-        if self.dynamics is not None:
-            self.dynamics.commit()
+        parts: list[Any] = [self.bodies, self.solver, self.dynamics]
+        for part in filter(None, parts):
+            part.commit()
         if self.linear is not None:
             self.linear.commit(self.dynamics)
         before = dict(zip(map(id, pairs), self._before.pairs))
@@ -405,7 +405,7 @@ class UnitedProblem(given.Sealed):
     def restore(self) -> None:
         """Return to the committed displacement and contact state."""
         self.u.x.array[:] = self.committed
-        with_states: list[Any] = [self.bodies, self.dynamics, self.linear]
+        with_states: list[Any] = [self.bodies, self.dynamics, self.linear, self.solver]
         for part in filter(None, with_states):
             part.restore()
         for pair in self.interfaces:

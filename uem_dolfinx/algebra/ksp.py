@@ -1,0 +1,101 @@
+"""A KSP with options: made from them, made again where the present one has to be kept, and adapted to unsymmetric matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from petsc4py import PETSc
+
+from uem_dolfinx import compat, given
+from uem_dolfinx.algebra.kept_preconditioner import KeptPreconditioner
+from uem_dolfinx.algebra.options import GMRES_RESTART, last_words
+from uem_dolfinx.algebra.returning import Returning
+from uem_dolfinx.errors import InputError
+from uem_dolfinx.geometry.nodes import Nodes
+
+#: Replacements for types of KSP and PC that need symmetric matrices.
+UNSYMMETRIC = {"cg": "gmres", "minres": "gmres", "cholesky": "lu", "icc": "ilu"}
+
+
+class KspOfOptions(Returning):
+    """A KSP and its preconditioner."""
+
+    made, stays = "ksp", ("lasting", "_unused")
+    space: Nodes
+    ksp: Any
+    options: dict[str, Any]
+    _prefix: str
+    _at_need: dict[str, Any]
+    _unused: set[str] | None
+
+    def _create_ksp(self) -> PETSc.KSP:
+        ksp = PETSc.KSP().create(self.space.comm)
+        #: The preconditioner of the options, which the KSP may use within a deflated one.
+        self.pc = ksp.getPC()
+        ksp.setOptionsPrefix(self._prefix)
+        ksp.setErrorIfNotConverged(False)
+        ksp.setConvergenceHistory(reset=True)
+        with self._in_database():
+            try:
+                ksp.setFromOptions()
+            except PETSc.Error as error:
+                raise InputError(
+                    f"PETSc refuses petsc_options = {given.shown(self.options)}: {last_words(error)}; correct them"
+                ) from error
+        return ksp
+
+    def _use(self, options: dict[str, Any]) -> None:
+        """Make a new KSP with these options (collective)."""
+        self.options = options
+        self.lose()
+        #: Whether the preconditioner has to be set up for the present matrix; what it was made for.
+        self._new, self._preconditioner = True, KeptPreconditioner()
+        self.ksp = self._create_ksp()
+        #: Whether the KSP is for symmetric matrices, and the types of KSP and PC in the options.
+        self._symmetric = True
+        self._types = self.ksp.getType(), self.pc.getType()
+
+    @contextmanager
+    def _in_database(self, **instead: Any) -> Iterator[None]:
+        """Put the options into PETSc's database, some with other values; levels of a multigrid read theirs during set-up."""
+        database, prefix, options = PETSc.Options(), self._prefix, self.options | instead
+        for key, value in options.items():
+            database[prefix + key] = value
+        try:
+            yield
+        finally:
+            for key in options:
+                if self._unused and compat.petsc_option_used(prefix + key) is not False:
+                    self._unused.discard(key)
+                del database[prefix + key]
+
+    @property
+    def iterative(self) -> bool:
+        """Whether solves have a tolerance."""
+        return bool(self.ksp.getType() != "preonly")
+
+    def _adapt(self, symmetric: bool) -> None:
+        """Use the KSP and PC of the options, or their replacements for unsymmetric matrices."""
+        if symmetric == self._symmetric:
+            return
+        self._symmetric = symmetric
+        pc, before = self.pc, self.pc.getType()
+        self._types = self._types if symmetric else (self.ksp.getType(), before)
+        ksp_type, pc_type = self._types if symmetric else (UNSYMMETRIC.get(kind, kind) for kind in self._types)
+        self.ksp.setType(ksp_type)
+        if ksp_type != self._types[0] or symmetric:
+            # GMRES measures true residuals, without preconditioner: P'KP is nearly singular if all contactors slip
+            self.ksp.setPCSide(PETSc.PC.Side.LEFT if symmetric else PETSc.PC.Side.RIGHT)
+        pc.setType(pc_type)
+        # a new PC reads its own options; an unchanged PC must not read them again, because hypre would lose its set-up
+        reader = pc
+        if pc.getType() == before:
+            reader = PETSc.PC().create(self.space.comm)
+            reader.setType("none")
+        self.ksp.setPC(reader)
+        few = {"ksp_max_it": GMRES_RESTART} if self._at_need and not symmetric and self.iterative else {}
+        with self._in_database(ksp_type=self.ksp.getType(), pc_type=reader.getType(), **few):
+            self.ksp.setFromOptions()
+        self.ksp.setPC(pc)
