@@ -19,9 +19,6 @@ from helpers import box, clamp, gathered_vector, scene, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import TargetFacets
-from uem_dolfinx.geometry.search import MeshTarget
 
 COMM = MPI.COMM_WORLD
 INNER, OUTER, W = 0.5, 2.0, 0.01
@@ -120,12 +117,13 @@ def test_pressures_converge():
     ("cell", "layers", "past"),
     [
         ("hexahedron", 1, 0.0),
+        *(slow("hexahedron", n, past) for n, past in product((1, 2), (0.01, 0.03))),
         *(slow("hexahedron", n, past) for n, past in product((1, 2, 4), (1e-12, -1e-12, 5e-4, -5e-4)) if n < 4 or past > 0.0),
         *(slow("tetrahedron", n, past) for n, past in product((1, 2), (0.0, 5e-4, -5e-4))),
     ],
 )
 def test_a_plug_as_long_as_its_tube(cell, layers, past):
-    """All or many of its nodes are at the ends of the tube, or drawn a little past them: they carry the closed form's pressure."""
+    """Its nodes are at the ends of the tube, or past them by up to a tenth of a facet: they carry the closed form's pressure."""
     problem, contact = plug(cell, 12, springs=1e-4, past=past, layers=layers)
     (step,) = uem.load_steps(problem, 1)
     p = pressures(contact)
@@ -133,20 +131,5 @@ def test_a_plug_as_long_as_its_tube(cell, layers, past):
     # twelve facets sag by more than the overlap; tetrahedra with one or two cells across are stiff, and their nodal areas differ
     assert abs(p.mean() / lame() - 1) < (0.12 if cell == "hexahedron" else 0.3)
     if cell == "hexahedron":
-        assert np.ptp(p) < (1e-9 if abs(past) < 1e-9 else 0.01) * p.mean()
-
-
-def test_behind_bends_at_the_end():
-    """Behind a vertex on the rim of a hole, points are behind its bend, by some of their depth also past its end, but no farther."""
-    s = scene(COMM, "hexahedron", [ring("hexahedron", 1.0, OUTER, 1, 12)])
-    hole = s.tag("hole", 0, lambda x: np.abs(np.hypot(x[:, 0], x[:, 1]) - 1.0) < 1e-6)
-    target = MeshTarget(TargetFacets(Configuration(fem.Function(compat.function_space(s.mesh, 1, (3,)))), hole))
-    angle, slope = np.arange(12) * np.pi / 6, np.tan(np.pi / 12)
-    for depth, (past, behind) in product((1e-6, 1e-2, 0.1), ((0.0, True), (1.5, True), (6.0, False))):
-        r = np.full(12, 1.0 + depth)
-        z = np.full(12, 0.5 + past * slope * depth)
-        p = target.project(np.column_stack([r * np.cos(angle), r * np.sin(angle), z]))
-        assert ((p.way_beyond < p.behind_bends) == behind).all()
-        # points in front of the hole are not
-        p = target.project(np.column_stack([(r - 2 * depth) * np.cos(angle), (r - 2 * depth) * np.sin(angle), z]))
-        assert not p.behind_bends.any()
+        # ends carry the force of what is past them
+        assert np.ptp(p) < (1e-9 if abs(past) < 1e-9 or layers == 1 else max(0.01, 4 * past)) * p.mean()

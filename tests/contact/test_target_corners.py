@@ -190,8 +190,8 @@ def test_what_is_a_corner(slope, cosine, expected, monkeypatch):
     [
         ("LACKING", {"w": 0.495}, {1: 1, 10: 0}),
         ("LACKING", {"w": 0.472, "n": 32}, {1: 0, 0.1: 1}),
-        ("ON_FACET", {"w": 0.495, "push": 5e-3}, {1: 1, 10: 0}),
-        ("ON_FACET", {"w": 0.495, "push": 1e-3}, {1: 0, 0.1: 1}),
+        ("ON_FACET", {"w": 0.495, "push": 5e-9}, {1: 1, 10: 0}),
+        ("ON_FACET", {"w": 0.495, "push": 1e-9}, {1: 0, 0.1: 1}),
     ],
 )
 def test_what_a_warning_of_corners_contains(name, how, moved, monkeypatch):

@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
-from uem_dolfinx.geometry.shapes import Tabulated, unit_normals
 
 #: A way from the foot that is shorter, in lengths of the facet, or leans from its normal by less, is rounding.
 #: [bound; cosine, and length of the facet; test_offset_edges.py::test_points_on_their_feet]
@@ -19,10 +18,6 @@ ALONG_NORMAL = 1e-12
 #: points by both facets, they do not.
 #: [convention; slope; test_behind_edges.py::test_shallow_edges]
 SHALLOW = 0.25
-#: A point inside is behind a concave bend at an end, not past it, up to so many times its depth times the slope of the averaged normal to
-#: the facet's: the point lies between two facets' normals, and at most twice as far from either as the averaged one.
-#: [convention; slope; test_conforming_rings.py::test_behind_bends_at_the_end]
-BEHIND_BENDS = 2.5
 #: Offsets of less than this part of the facet do not round a convex edge: Newton's steps are longer than such an arc.
 #: [heuristic; length of the facet; test_offset_edges.py::test_what_rounds_an_edge]
 ROUNDS_AN_EDGE = 1e-2
@@ -224,15 +219,6 @@ class FacetProjection:
     def from_middle(self) -> Array:
         """Ways from the middles of facets to the closest points ``(n, gdim)``."""
         return self.foot - self.x.mean(axis=1)
-
-    @cached_property
-    def behind_bends(self) -> Array:
-        """How far past an end points may be inside a concave target and still be behind a bend that reaches this end, a length ``(n,)``."""
-        own = unit_normals(Tabulated(self.weights, self.dN, self.ddN), self.x)
-        lean = np.einsum("ng,ng->n", own, self.averaged)
-        slope = np.linalg.norm(self.averaged - lean[:, None] * own, axis=1)
-        concave = np.einsum("ng,ng->n", self.averaged, self.from_middle) < 0.0
-        return np.where(concave, BEHIND_BENDS * slope * np.maximum(-self.height, 0.0), 0.0)
 
     def take(self, which: Ints) -> FacetProjection:
         """Some of its rows ``(k,)``."""

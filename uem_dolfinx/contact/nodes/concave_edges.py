@@ -165,7 +165,8 @@ class ConcaveEdges:
         # a contactor that still moves past the end of its corner gets averaged normals
         past = ~known & state.active & (state.changes >= MOST_CHANGES) & (held >= 0).any(axis=1)
         facet[past], held[past] = number[past], -1
-        return replace(state, facet=facet, held=held, changes=changes), entered or bool(past.any())
+        left_for_good = bool(past.any() or state.in_corner[switch].any())
+        return replace(state, facet=facet, held=held, changes=changes), entered or left_for_good
 
     def _at_bends(self, nearest: FacetProjection, which: Bools) -> Ints:
         """Contactors of ``which (n,)`` whose closest points are at a concave side or vertex of their facets ``(k,)``."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -124,6 +124,14 @@ class NodeToSurface(OnTarget):
         i = np.flatnonzero(held & (nearest.beyond != 0).any(axis=1))
         return self.target.continued(nearest, i, nearest.foot[i] + nearest.beyond[i]) if len(i) else nearest
 
+    def overhanging(self, projection: Projection, which: Bools) -> Bools:
+        """Which contactors ``(n,)`` past an end of the target have a facet over it ``(n,)`` (collective)."""
+        if not isinstance(projection, FacetProjection) or self.contactor is None or self.contactor.dim == 0:
+            return np.zeros(len(self.nodes), dtype=bool)
+        from uem_dolfinx.contact.nodes.overhang import overhanging
+
+        return overhanging(self.config, self.nodes, self.contactor, projection, which)
+
     def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:
         """Set the closest points of sticking contactors to their anchors, so that edges between facets have no effect (collective)."""
         f = state.friction
@@ -223,7 +231,7 @@ class NodalKinematics(PlacedOnTarget):
         """Open ends, which can hold contactors, except with two-pass contact, where the end itself touches; see ``Kinematics``."""
         s = self.of.setting
         holds = np.logical_and(self.of.ends_hold, ~s.mutual[s.label])
-        return Ends(self.projection, self.of.thickness, holds, out=self.out)
+        return Ends(self.projection, self.of.thickness, holds, None, self.out, partial(self.of.overhanging, self.projection))
 
     # -- equations and forces --------------------------------------------------------------------------------------------
 

@@ -301,7 +301,7 @@ class Interface:
                 self.friction.place(self.kinematics, self.trial)
             self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
         inside, ends = self.kinematics.projection.gap < 0, self.kinematics.ends
-        self.trial = replace(self.trial, barred=self.trial.barred & inside)
+        self.trial = replace(self.trial, barred=self.trial.barred & inside, at_end=ends.reached(self.trial))
         passed = self.off | (self.trial.passed & inside)
         reserved = self.trial.reserved & bool(self.trial.active.any())
         fresh = replace(self.trial, changes=np.zeros_like(self.trial.changes), passed=passed, reserved=reserved)

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.friction.limits import Limits
 from uem_dolfinx.contact.friction.sliding import Sliding
 from uem_dolfinx.contact.laws.law import FrictionLaw, parameters
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
 from uem_dolfinx.geometry.joined_rigid import JoinedRigid
-from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.projection import FacetProjection, Projection
 
 
 class JoinedNodes(NodeToSurface):
@@ -62,6 +62,14 @@ class JoinedNodes(NodeToSurface):
             one.set(free=changed["free"])
         if "far" in changed and self.target.n_nodes:
             self.target.asked = ~changed["far"][self.setting.label]
+
+    def overhanging(self, projection: Projection, which: Bools) -> Bools:
+        """See ``NodeToSurface``: by the facets of each contact."""
+        if not isinstance(projection, FacetProjection):
+            return super().overhanging(projection, which)
+        every = np.arange(len(self.nodes))
+        parts = [one.overhanging(projection.take(every[own]), which[own]) for one, own in zip(self._own, self.rows_of)]
+        return np.concatenate(parts)
 
     def across(self, found: FacetProjection, points: Array) -> FacetProjection:
         """See ``OnTarget``; only for contacts with offsets."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, replace
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.geometry.projection import FacetProjection, Projection
+from uem_dolfinx.geometry.projection import Projection
 from uem_dolfinx.geometry.search import ON_SIDE
 
 #: A contactor that came to the target at its end, or back after it had slid off, is held there up to this part of the facet beyond it.
@@ -28,7 +29,8 @@ class Ends:
     ========================================  ====================  =========================================================
     slides to an end                                                past the end to rounding (``ON_SIDE``)
     came to the end, or was drawn there       ``at_end``            past it by ``END_HOLDS`` of a facet: a blow is spared
-    was drawn in a concave bend at the end    ``at_end``            the same: facets bend towards it, as in a tube of its length
+    was drawn, or came in front, past it,     ``at_end``            the same: no other contactor is there
+    with a facet over the target
     has slid off in this step                 ``at_end, passed``    past the end to rounding; under mortar until
                                                                     ``COVERED_AGAIN`` of its share is covered
     had slid off before, is behind the plane  ``passed``            past the end to rounding
@@ -46,6 +48,7 @@ class Ends:
         holds: whether an end can hold contactors, for all or for each ``(n,)``; not with mortar, whose covered areas vanish there.
         share: covered part of each contactor's facets ``(n,)``, negative if irrelevant; None for nodal equations.
         out: contactors that must not touch the target ``(n,)``, or None.
+        overhanging: finds which of some contactors ``(n,)`` past an end have a facet over the target ``(n,)`` (collective), or None.
     """
 
     projection: Projection
@@ -53,6 +56,7 @@ class Ends:
     holds: bool | Bools = False
     share: Array | None = None
     out: Bools | None = None
+    overhanging: Callable[[Bools], Bools] | None = None
 
     def past(self, state: PairState) -> Bools:
         """Contactors past an end, or excluded for another reason except ``barred`` ``(n,)``."""
@@ -76,11 +80,18 @@ class Ends:
         return np.asarray(near & (state.at_end | ~(state.active | state.passed)))
 
     def drawn(self, state: PairState) -> Bools:
-        """Contactors held by an end in the first step ``(n,)``: those drawn behind a concave bend there are not past it."""
-        p = self.projection
-        if isinstance(p, FacetProjection):
-            state = replace(state, at_end=state.at_end | (p.way_beyond < p.behind_bends))
-        return self.held(state)
+        """Contactors held by an end in the first step ``(n,)``, also if drawn past it with a facet over the target (collective)."""
+        return self.held(replace(state, at_end=state.at_end | self._over(state)))
+
+    def reached(self, state: PairState) -> Bools:
+        """``at_end`` with contactors that have come past an end in front of the target, with a facet over it ``(n,)`` (collective)."""
+        return state.at_end | (self._over(state) & (self.projection.gap >= 0.0))
+
+    def _over(self, state: PairState) -> Bools:
+        """Contactors past an end with a facet over the target, except for those that have slid off in this step (collective)."""
+        if self.overhanging is None:
+            return np.zeros(len(state.active), dtype=bool)
+        return self.overhanging(self.holds & ~state.active & ~(state.at_end & state.passed))
 
     def near(self, state: PairState, reach: float) -> Bools:
         """Contactors that are active, or not past an end and within one facet of the target, or ``reach`` of a rigid one ``(n,)``."""

@@ -29,9 +29,9 @@ from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import reduced
 
-#: Corners that penetrate a facet by less than this part of its size lie on the facet.
-#: [convention; size of the facet; test_target_corners.py::test_what_a_warning_of_corners_contains]
-ON_FACET = 1e-2
+#: Corners that penetrate a facet by less than this part of its size lie on the facet, as Newton's method is no more accurate.
+#: [bound; size of the facet; test_target_corners.py::test_what_a_warning_of_corners_contains]
+ON_FACET = 1e-8
 #: A warning is given if the missing force of corners exceeds this part of the contact force: resultants are wrong by one per cent or more.
 #: [convention; largest contact force so far; test_target_corners.py::test_what_a_warning_of_corners_contains]
 LACKING = 0.1
@@ -155,8 +155,8 @@ class TargetCorners:
         p = surface.project_onto(config.x[near], of_contact[label])
         depth, part = -p.gap, -p.gap / p.facet_size
         inside = (part > ON_FACET) & (p.from_end > 0.0) & (p.beyond == 0.0).all(axis=1)
-        # a corner deeper than the cell behind the facet may have left the body at its back
-        inside &= depth < surface.of_facets(p.facet, surface.facets.depth)
+        # a corner deeper than the cell behind the facet may have left the body at its back, but not without any force
+        inside &= (depth < surface.of_facets(p.facet, surface.facets.depth)) | (self.largest == 0.0)[label]
         if not reduced(comm, int(inside.sum())):
             return {}
         stiffness = np.abs(stiffness)
@@ -164,9 +164,10 @@ class TargetCorners:
         theirs = np.einsum("na,nag,ng->n", p.weights, of_facet, p.normal**2)
         own = np.einsum("ng,ng->n", stiffness[near], p.normal**2)
         both = np.where(inside, theirs * own / np.where(theirs + own > 0.0, theirs + own, 1.0), 0.0)
-        lacking = reduced(comm, sums_of_rows(label, (both * depth)[:, None], n)[:, 0])
+        lacking, some = reduced(comm, sums_of_rows(label, np.column_stack([both * depth, inside]), n).T)
         harmful = {}
-        for k in np.flatnonzero(lacking > LACKING * self.largest):
+        # without any contact force every corner inside matters, also in a body without stiffness
+        for k in np.flatnonzero((some > 0) & (lacking >= LACKING * self.largest)):
             which = np.flatnonzero(inside & (label == k))
             found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in which]
             everywhere = sorted((one for there in comm.allgather(found) for one in there), reverse=True)
