@@ -11,10 +11,13 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import at, blocks, box, clamp, linear, modulus, run
+import ufl
+from dolfinx import fem
+from helpers import Body, at, blocks, box, clamp, linear, modulus, run, scene, slow
 from pointed_scenes import ironing, neo_hooke, pressed, punch, slot, tooth, wedge
 
 import uem_dolfinx as uem
+from uem_dolfinx import compat
 from uem_dolfinx.contact.warnings import target_corners
 from uem_dolfinx.contact.warnings.target_corners import corner_nodes
 
@@ -209,3 +212,35 @@ def test_corners_on_both_sides_are_not_swapped(both):
     """Where the contactor has corners in contact, too, the other side does not see them either: mortar alone is advised."""
     words = str(target_corners.CornerInside("(0, 0)", 0.1, 0.2, 0.3, both))
     assert ("swap the two" in words) != both and "take coupling = 'mortar'" in words
+
+
+def turning_plug(m, springs, swap):
+    """A plug of m facets in a hole with vertices opposite its own, larger by a hundredth; the plug is the target if swapped."""
+
+    def ring(low, high, n):
+        b = box("quadrilateral", [low, 0.0], [high, 2.0 * np.pi], [n, m])
+        x = np.column_stack([b.x[:, 0] * np.cos(b.x[:, 1]), b.x[:, 0] * np.sin(b.x[:, 1])])
+        _, first, inverse = np.unique(np.round(x, 9), axis=0, return_index=True, return_inverse=True)
+        return Body(x[first], inverse.ravel()[b.cells])
+
+    s = scene(COMM, "quadrilateral", [ring(1.0, 2.0, 4), ring(0.5, 1.01, 2)])
+    u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
+    own, hole = (
+        s.tag(name, b, lambda x, r=r: np.abs(np.hypot(*x.T) - r) < 1e-6) for name, b, r in (("plug", 1, 1.01), ("hole", 0, 1.0))
+    )
+    contact = uem.Contact(*((hole, own) if swap else (own, hole)), max_penetration=0.2)
+    F = neo_hooke(u, 1.0) + springs * ufl.dot(u, ufl.TestFunction(u.function_space)) * ufl.dx
+    return uem.UnitedProblem(F, u, contacts=[contact]), contact
+
+
+@pytest.mark.parametrize(
+    "m, swap, factor, expected",
+    [(24, True, 1, 1), (24, False, 1, 0), slow(48, True, 1, 1), slow(24, True, 10, 1), slow(24, True, 100, 0)],
+)
+def test_a_polygon_that_turns_in_its_hole(m, swap, factor, expected, caplog, monkeypatch):
+    """As target it turns until its vertices meet middles of facets, almost free of force, which is named; as contactor it does not."""
+    monkeypatch.setattr(target_corners, "LACKING_AT_VERTICES", factor * target_corners.LACKING_AT_VERTICES)
+    problem, _ = turning_plug(m, 1e-4, swap)
+    run(problem)
+    assert len(told(caplog)) == expected
+    assert all("swap the two" in message and "corners = True" not in message for message in told(caplog))
