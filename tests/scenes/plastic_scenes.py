@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
+from uem_dolfinx.materials.elastic import differentiate
 
 E, NU, FY, H = 200.0, 0.3, 0.4, 15.0
 MU = E / (2 * (1 + NU))
@@ -124,6 +125,7 @@ def tangent_in_flow(material: uem.VonMises, u: fem.Function) -> None:
     flowing = material._trial.peeq > material._committed()[1]
     assert comm.allreduce(int(flowing.sum())) > 0
     v, du = ufl.TestFunction(V), ufl.TrialFunction(V)
+    differentiate([material])
     K = matrix(ufl.derivative(material.residual(v), u, du) + material.stiffness(du, v))
     x, y = K.createVecRight(), K.createVecRight()
     X = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local, : len(u)]

@@ -25,6 +25,7 @@ from uem_dolfinx.accuracy.tractions import contact_tractions, outside
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.nodes import Nodes
+from uem_dolfinx.materials.elastic import differentiate
 from uem_dolfinx.solve.problem import UnitedProblem
 
 
@@ -53,6 +54,7 @@ class Enriched:
         self.cells = compat.cell_dofs(self.W)
         self.test = ufl.TestFunction(self.W)
         self.held = self._held()
+        differentiate(problem.materials)
         F, test, trial = bodies.F, bodies.F.arguments()[0], ufl.TrialFunction(self.W)
 
         def stiffness(along: Any, of: Any) -> Any:

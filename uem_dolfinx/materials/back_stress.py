@@ -60,10 +60,14 @@ def kinematic_return(
     step = points.step(L, curve)
     new[i] = step.peeq
     flowed = logarithmic_return(gradient, plastic, new, mu, Linear(np.full(len(mu), np.inf), np.zeros(len(mu))), components)
-    mixed = points.mixed(L, F[i], components)
-    flowed.tangent[i] -= mixed.transpose(0, 2, 1) @ np.linalg.solve(step.hessian, mixed)
     strains = np.log1p(-2 * np.linalg.eigvalsh(to_tensors(np.where(np.isfinite(plastic), plastic, 0.0)))) / 2
-    return replace(flowed, energy=flowed.energy + modulus / 3 * (strains**2).sum(axis=1))
+
+    def tangent() -> Array:
+        found, mixed = flowed.tangent(), points.mixed(L, F[i], components)
+        found[i] -= mixed.transpose(0, 2, 1) @ np.linalg.solve(step.hessian, mixed)
+        return found
+
+    return replace(flowed, tangent=tangent, energy=flowed.energy + modulus / 3 * (strains**2).sum(axis=1))
 
 
 def _minimised(points: _Points, curve: YieldCurve, L: Array) -> Array:

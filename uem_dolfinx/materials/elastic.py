@@ -6,6 +6,7 @@ A convenience: the united solver takes any UFL residual.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeAlias
 
@@ -275,6 +276,7 @@ class HistoryMaterial(Protocol):
 
     Functions in its forms may refer to it weakly by an attribute ``material``, and the law to its displacement by ``u``. In a mixed
     space ``displacement`` is the number of the displacement's part; ``stiffness`` gets trial and test functions of the whole space.
+    A law may find its tangent in a method ``differentiate()``, which is called before K is assembled, instead of in ``update``.
     """
 
     #: Committed Functions that the stress depends on, by name.
@@ -294,6 +296,13 @@ class HistoryMaterial(Protocol):
 
     def dissipation(self) -> float:
         """Energy dissipated since the start (collective)."""
+
+
+def differentiate(materials: Sequence[Any]) -> None:
+    """Bring what ``stiffness`` of laws with history contains up to date with their last ``update``."""
+    for material in materials:
+        if hasattr(material, "differentiate"):
+            material.differentiate()
 
 
 def is_history_material(material: object) -> bool:

@@ -93,8 +93,9 @@ class FinitePlasticity(VonMises):
         quadrature_degree: int | None = None,
     ):
         given.word("kind", kind, tuple(VARYING))
-        #: Outcome of the last update.
+        #: Outcome of the last update, and whether its tangent is known to the forms.
         self._trial: Flowed
+        self._differentiated = False
         super().__init__(
             u, E, nu, yield_stress, hardening, kinematic_hardening=kinematic_hardening, displacement=displacement, kind=kind,
             cells=cells, quadrature_degree=quadrature_degree,
@@ -172,7 +173,7 @@ class FinitePlasticity(VonMises):
         return ufl.dot(self._piola, self._components(v)) * self._points.dx + pressed
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
-        """The deviator's part of the tangent, missing in ``ufl.derivative(residual(v), u)``; see ``VonMises.stiffness``."""
+        """The deviator's part of the tangent, as of the last ``differentiate``; see ``VonMises.stiffness``."""
         du, v = self._part(du), self._part(v)
         count = len(VARYING[self.kind][0])
         number = np.zeros((count, count), int)
@@ -182,7 +183,7 @@ class FinitePlasticity(VonMises):
         return ufl.inner(ufl.dot(A, self._components(du)), self._components(v)) * self._points.dx
 
     def update(self) -> None:
-        """Stress and tangent at the present displacement, from the committed history; NotFiniteError if they are not (collective)."""
+        """Stress at the present displacement, from the committed history; NotFiniteError if it is not finite (collective)."""
         with timed("return mapping"):
             varying = VARYING[self.kind]
             with np.errstate(over="ignore", invalid="ignore"):
@@ -192,10 +193,8 @@ class FinitePlasticity(VonMises):
                 stress[:, :3] += (self._bulk[:, None] * logarithm).reshape(-1, 1)
                 stress *= np.exp(-logarithm).reshape(-1, 1)
             self._refuse_infinite(stress)
-            self._trial = flowed
-            rows, columns = np.triu_indices(len(varying[0]))
+            self._trial, self._differentiated = flowed, False
             self._points.write(self._piola, flowed.first_piola)
-            self._points.write(self._upper, flowed.tangent[:, rows, columns])
             self._points.write(self.stress, stress)
 
     def _gradients(self) -> Array:
@@ -218,6 +217,15 @@ class FinitePlasticity(VonMises):
         from uem_dolfinx.materials.logarithmic_slopes import logarithmic_back
 
         return lambda w: self._components(self._part(w)), logarithmic_back
+
+    def differentiate(self) -> None:
+        """The tangent at the displacement of the last ``update``."""
+        if self._differentiated:
+            return
+        with timed("return mapping"), np.errstate(over="ignore", invalid="ignore"):
+            rows, columns = np.triu_indices(len(VARYING[self.kind][0]))
+            self._points.write(self._upper, self._trial.tangent()[:, rows, columns])
+            self._differentiated = True
 
     def _return(self, gradient: Array, plastic_strain: Array, peeq: Array) -> Flowed:
         before, varying = (gradient, plastic_strain, peeq, self._mu), VARYING[self.kind]

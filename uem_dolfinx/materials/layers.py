@@ -105,8 +105,8 @@ class Layers:
         """Return of all layers in finite strain: their history ``(n j, k)`` and ``(n j,)``, and means for the body."""
         mu, gradient = self.repeat(mu), self.repeat(gradient)
         each = logarithmic_return(gradient, plastic_strain, peeq, mu, self.curve, components)
-        stress, piola, tangent, energy = (self.mean(v) for v in (each.stress, each.first_piola, each.tangent, each.energy))
-        return Flowed(stress, piola, tangent, each.plastic_strain, each.peeq, energy)
+        stress, piola, energy = (self.mean(values) for values in (each.stress, each.first_piola, each.energy))
+        return Flowed(stress, piola, lambda: self.mean(each.tangent()), each.plastic_strain, each.peeq, energy)
 
     def radial_return(self, strain: Array, plastic_strain: Array, peeq: Array, mu: Array) -> Returned:
         """Return of all layers: their history ``(n j, k)`` and ``(n j,)``, j vectors m, and means for the body."""

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +28,7 @@ class Flowed:
     Attributes:
         stress: deviator of the Kirchhoff stress ``(n, k)``.
         first_piola: the first Piola-Kirchhoff stress that belongs to it, components ``(n, c)``.
-        tangent: its derivative by the same components of F ``(n, c, c)``, symmetric.
+        tangent: finds its derivative by the same components of F ``(n, c, c)``, symmetric.
         plastic_strain: ``(1 - C_p^-1) / 2``, C_p the plastic right Cauchy-Green tensor ``(n, k)``.
         peeq: equivalent plastic strain ``(n,)``.
         energy: stored by the deviator, per reference volume ``(n,)``.
@@ -36,7 +36,7 @@ class Flowed:
 
     stress: Array
     first_piola: Array
-    tangent: Array
+    tangent: Callable[[], Array]
     plastic_strain: Array
     peeq: Array
     energy: Array
@@ -81,14 +81,19 @@ def logarithmic_return(
     # plastic strain grows along the axes by the exponential map, pulled back to the drawing
     shrunk = (1 + change[i]) * np.expm1(-6 * (mu[i] * dp[i] / q[i])[:, None] * d[i])
     plastic[i] -= (pulled[i] * shrunk[:, None, :]) @ pulled[i].transpose(0, 2, 1) / 2
-    # components of n_a x F^-1 n_b, points last as there are many of them
-    along, back = (np.ascontiguousarray(A.transpose(2, 1, 0)) for A in (axes, pulled))
-    basis = along[:, None, components[0]] * back[None, :, components[1]]
-    tangent = np.einsum("abin,abjn->ijn", basis, _principal_tangent(change.T, d.T, s.T, a, c, basis)).transpose(2, 0, 1)
     stress = to_components((axes * s[:, None, :]) @ axes.transpose(0, 2, 1), size)
-    piola = np.einsum("na,aain->ni", s, basis)
-    for values in (stress, piola, tangent):
+    piola = ((axes * s[:, None, :]) @ pulled.transpose(0, 2, 1))[:, components[0], components[1]]
+    for values in (stress, piola):
         values[lost] = np.nan
+
+    def tangent() -> Array:
+        # components of n_a x F^-1 n_b, points last as there are many of them
+        along, back = (np.ascontiguousarray(A.transpose(2, 1, 0)) for A in (axes, pulled))
+        basis = along[:, None, components[0]] * back[None, :, components[1]]
+        found = np.einsum("abin,abjn->ijn", basis, _principal_tangent(change.T, d.T, s.T, a, c, basis)).transpose(2, 0, 1)
+        found[lost] = np.nan
+        return np.asarray(found)
+
     return Flowed(stress, piola, tangent, to_components(plastic, size), new, (s**2).sum(axis=1) / (4 * mu))
 
 

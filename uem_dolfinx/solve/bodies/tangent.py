@@ -27,6 +27,7 @@ from uem_dolfinx.errors import InvertedElementError, NotFiniteError, SpaceError,
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
+from uem_dolfinx.materials.elastic import differentiate
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class Tangent:
         self._values: list[Array] | None = None
         with compiling("the tangent"):
             self._form = forms.form(J)
-        self._unknowns = config.unknowns
+        self._materials, self._unknowns = materials, config.unknowns
         self.K: PETSc.Mat = self._unknowns.create_matrix(self._form)
         #: Components without Dirichlet condition ``(n_rows, gdim)``.
         self._free: Bools = np.ones((0, 0), dtype=bool)
@@ -107,6 +108,7 @@ class Tangent:
 
     def update(self) -> None:
         """Assemble K if something that it depends on has changed (collective)."""
+        differentiate(self._materials)
         values, same = forms.read_values(self._inputs, self._values)
         factor = self._dynamics.factor if self._dynamics is not None else 0.0
         same &= factor == self._factor
