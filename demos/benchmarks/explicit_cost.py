@@ -1,4 +1,4 @@
-"""What an explicit step costs: time over that of the residual, share of contact, calls of Python, and traffic and cells of each rank.
+"""What an explicit step costs: time over that of the residual, share of contact, calls of Python, traffic, and what memory allows.
 
 ``PYTHONPATH=demos python demos/benchmarks/explicit_cost.py --json FILE`` measures on 1 and 2 ranks, in processes of their own.
 A bar with a square section hits a rigid wall; steps are timed while it stays there, each after an assembly of its residual. On one rank
@@ -11,7 +11,6 @@ import argparse
 import json
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,23 @@ LAWS, CELLS = {"linear": uem.LinearElastic, "NeoHooke": uem.NeoHooke}, ("tetrahe
 #: Stages of a step that contact makes.
 CONTACT = ("search and projection", "uniting equations", "united matrix of explicit steps")
 STEPS, LENGTH, GAP, C = 20, 3, 0.01, 30.0
+#: Numbers in an array of the triad, over all ranks, far more than the caches hold.
+TRIAD = 20_000_000
+
+
+def bandwidth() -> float:
+    """Bytes a second that all ranks of this call together move between memory and processors, by ``a = b + 3 c`` in two sweeps."""
+    a, b, c = (np.full(TRIAD // comm.size, value) for value in (0.0, 1.0, 2.0))
+    times = []
+    for _ in range(5):
+        comm.barrier()
+        start = time.perf_counter()
+        np.multiply(c, 3.0, out=a)
+        np.add(a, b, out=a)
+        comm.barrier()
+        times.append(time.perf_counter() - start)
+    # two arrays in the first sweep, three in the second
+    return 5 * 8 * TRIAD / max(comm.allgather(min(times)))
 
 
 def cost(law: str, cell: str, n: int, contactors: str = "massless") -> dict[str, Any]:
@@ -57,10 +73,12 @@ def cost(law: str, cell: str, n: int, contactors: str = "massless") -> dict[str,
         passed += time.perf_counter() - begin
         times.append((between - start, clock() - between))
     within = sum(log.timing(stage)[1] for stage in CONTACT) - before
-    calls: Counter[str] = Counter()
-    sys.setprofile(lambda frame, event, arg: calls.update([event]) if event in ("call", "c_call") else None)
-    next(steps)
-    sys.setprofile(None)
+    calls = []
+    for _ in range(STEPS):
+        calls.append(0)
+        sys.setprofile(lambda frame, event, arg: calls.append(calls.pop() + 1) if event in ("call", "c_call") else None)
+        next(steps)
+        sys.setprofile(None)
     sent: dict[str, int] = {}
     if collectives.counts():
         with collectives.traffic() as stages:
@@ -70,7 +88,7 @@ def cost(law: str, cell: str, n: int, contactors: str = "massless") -> dict[str,
     return {
         "law": law, "cell": cell, "contactors": contactors, "ranks": comm.size, "unknowns": 3 * V.dofmap.index_map.size_global,
         "residual": float(of_residual), "step": float(of_step), "over_residual": float(of_step / of_residual),
-        "contact_share": max(comm.allgather(within / passed)), "calls": sum(calls.values()),
+        "contact_share": max(comm.allgather(within / passed)), "calls": int(np.median(calls)), "mean_calls": float(np.mean(calls)),
         "cells": comm.allgather(s.mesh.topology.index_map(3).size_local), "sent": comm.allgather(sent),
     }  # fmt: skip
 
@@ -89,14 +107,16 @@ if __name__ == "__main__":
         for ranks in map(int, args.ranks.split(",")):
             points += run_on(ranks, __file__, counting=True, sizes=args.sizes)["points"]
     else:
+        moved = bandwidth()
         scenes = [(law, cell, "massless") for law in LAWS for cell in CELLS] + [("linear", "hexahedron", "massy")]
-        points = [cost(*one[:2], n, one[2]) for n in map(int, args.sizes.split(",")) for one in scenes]
+        points = [cost(*one[:2], n, one[2]) | {"bandwidth": moved} for n in map(int, args.sizes.split(",")) for one in scenes]
     alone = {(p["law"], p["cell"], p["contactors"], p["unknowns"]): p["step"] for p in points if p["ranks"] == 1}
     for p in points if args.where == "apart" else ():
         p["speed_up"] = alone.get((p["law"], p["cell"], p["contactors"], p["unknowns"]), np.nan) / p["step"]
         print(
             f"{p['law']:9} {p['cell']:12} {p['contactors']:9} {p['unknowns']:8d} unknowns, {p['ranks']} ranks: {1e3 * p['step']:.3g} ms, "
-            f"{p['over_residual']:.2f} x residual, contact {p['contact_share']:.0%}, {p['calls']} calls, speed-up {p['speed_up']:.2f}, "
+            f"{p['over_residual']:.2f} x residual, contact {p['contact_share']:.0%}, "
+            f"{p['calls']} calls ({p['mean_calls']:.0f} in the mean), {1e-9 * p['bandwidth']:.3g} GB/s, speed-up {p['speed_up']:.2f}, "
             f"cells {p['cells']}, messages {[sent.get('messages', 0) for sent in p['sent']]}"
         )
     if args.json and comm.rank == 0:

@@ -78,7 +78,7 @@ class Nodes:
     def vector(self, values: npt.ArrayLike | None = None) -> PETSc.Vec:
         """A vector with these values at the owned components, or zeros."""
         v = self._like.duplicate()
-        v.array[:] = 0.0 if values is None else np.ravel(values)
+        v.array[:] = 0.0 if values is None else np.asarray(values).reshape(-1)
         return v
 
     #: Whether there are unknowns in addition to nodal ones.

@@ -185,7 +185,6 @@ class FinitePlasticity(VonMises):
     def update(self) -> None:
         """Stress at the present displacement, from the committed history; NotFiniteError if it is not finite (collective)."""
         with timed("return mapping"):
-            varying = VARYING[self.kind]
             with np.errstate(over="ignore", invalid="ignore"):
                 flowed = self._return(self._gradients(), *self._committed())
                 logarithm = self._volume_changes() @ self._spread.T

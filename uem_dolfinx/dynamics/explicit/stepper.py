@@ -40,7 +40,7 @@ CHECKED_STRAIN = 0.1
 #: [convention; strain; test_explicit_materials.py::test_rubber_at_the_speed_of_its_waves]
 STEADY_STRAIN = 0.1
 #: A run ends where the least height of all cells falls below this part of the mesh's least one: cells collapse, and steps with them.
-#: [bound; the least height; -]
+#: [convention; the least height; test_explicit_materials.py::test_cells_that_collapse]
 COLLAPSED = 1e-3
 #: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from.
 #: [format; wave numbers; -]
@@ -331,7 +331,9 @@ class ExplicitStepper:
 def _inverse(A: Array) -> Array:
     """Inverses of matrices ``(g, g, n)``, by cofactors: a library's loop over small matrices takes ten times as long."""
     if len(A) == 2:
-        cofactors = np.stack([np.stack([A[1, 1], -A[1, 0]]), np.stack([-A[0, 1], A[0, 0]])])
+        cofactors = A[::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]])[:, :, None]
     else:
-        cofactors = np.stack([np.cross(A[i - 2], A[i - 1], axis=0) for i in range(3)])
+        i, j = np.arange(3) - 2, np.arange(3) - 1
+        B, C = A[i], A[j]
+        cofactors = B[:, i] * C[:, j] - B[:, j] * C[:, i]
     return np.asarray(cofactors.transpose(1, 0, 2) / (A[0] * cofactors[0]).sum(axis=0))
