@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.offsets import Offsets
     from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.seam.state import PairState
+    from uem_dolfinx.contact.warnings.confined import Confined
     from uem_dolfinx.contact.warnings.edges_inside import EdgesInside, Meeting
     from uem_dolfinx.contact.warnings.target_corners import CornerInside
 
@@ -39,6 +40,7 @@ class WatchedContact(OfBothSides):
     adjust: float | bool
     tied: bool | str
     target: Any
+    of_all_surfaces: bool
     _offsets: Offsets | None
 
     def begin(self, overlaps: Mapping[int, float]) -> None:
@@ -153,6 +155,12 @@ class Watch:
 
             warn_of_seams([contact.pair for contact in contacts])
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
+        self._confined: Confined | None = None
+        by_nodes = any(c.sees_corners and isinstance(c.target, Tag) for c in contacts)
+        if by_nodes and not any(c.of_all_surfaces for c in contacts):
+            from uem_dolfinx.contact.warnings.confined import Confined
+
+            self._confined = Confined([c for c in contacts if not c.is_further_part])
         self._begin()
         self._take_edges()
         for group in _by_interface([c for c in contacts if not c.adjust]).values():
@@ -194,6 +202,8 @@ class Watch:
         looked_at = [c for c in self._contacts if c.on and not c.pair.far]
         for group in _by_interface(looked_at).values():
             self._look_at_ends(group)
+        if self._confined is not None:
+            self._confined.look()
         self._look_at_edges()
         for contact, corner in self.corners_inside([c for c in looked_at if c.corner is None], stiffness).items():
             contact.note_corner(corner)
