@@ -19,6 +19,9 @@ EASY = 6
 #: What is left to the end, or to a multiple of the nominal length, is rounding below this part of it.
 #: [convention; nominal length; test_thresholds_motion.py::test_no_step_for_rounding]
 REMAINDER = 1e-9
+#: Two attempts of a step with as many equal iterations, to the last bit, do not depend on its length.
+#: [convention; iterations; test_step_control.py::test_attempts_that_repeat]
+REPEATED = 3
 
 
 #: Errors that a shorter step may avoid.
@@ -51,6 +54,8 @@ class StepControl:
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
         self._cuts, self._read, self._longest_before, self.due, self.stretch, self.resolved = 0, False, np.inf, 0, 0.0, np.inf
         self.of_contact, self.shortest, self.accurate = False, np.inf, np.inf
+        #: History of the last attempt of this step, which failed.
+        self._failed: list[object] = []
 
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""
@@ -79,9 +84,13 @@ class StepControl:
         Returns:
             Whether to try again: not if the error does not depend on the length, or if the step would become too short.
         """
-        mendable = isinstance(error, MENDABLE)
-        if not mendable or part * length < SHORTEST_LENGTH * self.nominal:
-            if mendable:
+        mendable, before = isinstance(error, MENDABLE), self._failed
+        self._failed = getattr(error, "history", [])
+        repeats = len(before) >= REPEATED and self._failed == before
+        if not mendable or repeats or part * length < SHORTEST_LENGTH * self.nominal:
+            if repeats:
+                error.amend("shorter steps repeat the same iterations: none of what the step changes has an effect")
+            elif mendable:
                 error.amend(f"shorter steps, down to {length:.3g}, are no better")
             self.give_up()
             return False
@@ -119,7 +128,7 @@ class StepControl:
 
     def give_up(self) -> None:
         """After a final failure, reset the length to its value before the failed step."""
-        self.longest = self._longest_before
+        self.longest, self._failed = self._longest_before, []
 
     def done(self, iterations: Sequence[Any], longer: float = 2.0) -> tuple[int, int]:
         """Count a step that converged with this history; returns its number and the number of its cuts.
@@ -131,7 +140,7 @@ class StepControl:
         solves = len(iterations) - 1
         if solves <= EASY or solves <= EASY * [one.linear_iterations for one in iterations].count(0):
             self.longest *= longer
-        self._longest_before = self.longest
+        self._longest_before, self._failed = self.longest, []
         cuts, self._cuts, self.number = self._cuts, 0, self.number + 1
         return self.number, cuts
 
