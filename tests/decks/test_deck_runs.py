@@ -269,6 +269,7 @@ def test_what_is_refused(folder):
 
 def test_vibrations(folder):
     """Of a column of two cells along itself, in the closed form of linear cells with their consistent mass; none without *FREQUENCY."""
+    pytest.importorskip("slepc4py")
     rho, h = 7.8e-9, 0.5
     text = (
         columns([(0.0, 1.0, 2)]) + STEEL + "*SOLID SECTION, ELSET=body 1, MATERIAL=steel\n*BOUNDARY\nfoot 1, 1, 3\nhead 1, 1, 2\n"
