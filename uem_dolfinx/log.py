@@ -23,14 +23,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def _is_rank_zero(record: logging.LogRecord) -> bool:
-    """Let a record pass on rank 0 of the world only."""
-    return MPI.COMM_WORLD.rank == 0
-
-
 logger = logging.getLogger("uem_dolfinx")
 """Rank 0's logger; handlers and levels are the application's business."""
-logger.addFilter(_is_rank_zero)
+logger.addFilter(lambda record: MPI.COMM_WORLD.rank == 0)
 
 
 def say(line: str) -> None:

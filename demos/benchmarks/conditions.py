@@ -3,16 +3,16 @@
 Signorini's problem of two bodies on nested meshes of linear cells. Every method has the parameter with the least condition number among
 those whose pressures err by at most ``AS_GOOD`` times the least of the method. ``PYTHONPATH=demos python -m benchmarks.conditions --json
 demos/benchmarks/report/conditions.json`` takes a few minutes on one rank; ``python demos/benchmarks/report/tables.py`` writes the table.
+
+Options:
+    sizes: number of meshes
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
 from typing import Any
 
-from common import comm
+from common import arguments, comm, report
 from benchmarks import methods
 from benchmarks.adapted import AS_GOOD
 from benchmarks.measure import measure
@@ -43,10 +43,7 @@ def row(n: int, ratio: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--sizes", type=int, default=3)
-    args = parser.parse_args()
+    args = arguments(__doc__, sizes=3)
     if comm.size > 1:
         raise SystemExit("eigenvalues are found on one rank: run this without mpirun")
     rows: list[dict[str, Any]] = []
@@ -54,5 +51,4 @@ if __name__ == "__main__":
         for n in (4, 8, 16)[: args.sizes]:
             rows.append(row(n, ratio))
             print(rows[-1], flush=True)
-    if args.json:
-        args.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    report(args, {"rows": rows})

@@ -12,20 +12,20 @@ With psi = sqrt(1/4 - r^2), continued by its tangent, the membrane lies on the b
     b / a = -a / sqrt(1/4 - a^2),    b ln a = sqrt(1/4 - a^2)
 
 ``PYTHONPATH=demos python -m benchmarks.obstacle --json demos/benchmarks/report/obstacle.json`` takes about a minute on one rank.
+
+Options:
+    sizes: number of meshes
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 import ufl
-from common import comm
+from common import arguments, comm, report
 from dolfinx import fem, mesh
 from scipy.optimize import brentq
 from scipy.sparse import bmat, csc_matrix, diags, identity
@@ -222,10 +222,7 @@ def row(m: Membrane, name: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--sizes", type=int, default=4)
-    args = parser.parse_args()
+    args = arguments(__doc__, sizes=4)
     if comm.size > 1:
         raise SystemExit("the matrices are SciPy's, on one rank: run this without mpirun")
     rows = []
@@ -234,5 +231,4 @@ if __name__ == "__main__":
         for name in METHODS:
             rows.append(row(membrane, name))
             print(rows[-1], flush=True)
-    if args.json:
-        args.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    report(args, {"rows": rows})

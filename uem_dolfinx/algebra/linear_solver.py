@@ -110,11 +110,6 @@ class UnitedSolver(KspOfOptions):
         """Whether solves for another active set need no factorisation."""
         return self.iterative or self._on_condensed or self._served is not None
 
-    @property
-    def needs_near_null_space(self) -> bool:
-        """Whether the preconditioner can use the rigid-body modes."""
-        return self.pc.getType() in ("gamg", "ml", "bddc") and not self.space.mixed
-
     def set_operator(
         self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, roughly: bool = False
     ) -> None:
@@ -188,7 +183,8 @@ class UnitedSolver(KspOfOptions):
             self._preconditioner.serves(restriction.equations, *changes)
         self.pc.setReusePreconditioner(not self._new)
         self._A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        if self._new and self.needs_near_null_space:
+        # these preconditioners can use the rigid-body modes
+        if self._new and self.pc.getType() in ("gamg", "ml", "bddc") and not self.space.mixed:
             self._A.setBlockSize(self.space.block)
             self._A.setNearNullSpace(near_null_space(self.space, self._A, restriction))
         self.pc.setOperators(self._A)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.conditions.equation import GivenRows, rows_of
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
+
+if TYPE_CHECKING:
+    from uem_dolfinx.conditions.equation import GivenRows
 
 
 class Seams:
@@ -67,6 +70,8 @@ class Seams:
 def seams_of(config: Configuration) -> Seams | None:
     """The equations of users with a configuration, or None without any (first time: collective)."""
     if config.seams is None and config.equations:
+        from uem_dolfinx.conditions.equation import rows_of
+
         config.seams = Seams(rows_of(config, config.equations))
     return config.seams
 

@@ -68,7 +68,8 @@ class TargetFacets:
         self.entities: Indices = tag.entities[of.own]
         self._orient(cell_dofs)
         self.open_sides = self._open_sides()
-        self.open_nodes = self._open_nodes()
+        #: Nodes of each facet on a side, of any facet, that bounds the surface ``(m, nn)``.
+        self.open_nodes = self.on_sides(self.open_sides)[self.dofs]
 
     @cached_property
     def keys(self) -> Ints:
@@ -125,10 +126,6 @@ class TargetFacets:
     def _open_sides(self) -> npt.NDArray[np.bool_]:
         """Sides of each facet that bound the surface ``(m, n_sides)``: they belong to one target facet only."""
         return (count_keys(self.config.comm, self.side_keys()) == 1).reshape(len(self.nodes), len(self.shape.edges))
-
-    def _open_nodes(self) -> npt.NDArray[np.bool_]:
-        """Nodes of each facet on a side, of any facet, that bounds the surface ``(m, nn)`` (collective)."""
-        return self.on_sides(self.open_sides)[self.dofs]
 
     def on_sides(self, which: Bools) -> Bools:
         """Local nodes on the sides ``which (m, n_sides)`` of facets of any rank ``(n_local,)`` (collective)."""

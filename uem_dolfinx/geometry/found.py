@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -131,10 +131,6 @@ class Found:
     def bodies(self) -> list[Block]:
         """Blocks of cells of the bodies."""
         return [block for block in self.cells if block.dim == self.dim]
-
-    def with_cells(self, points: Array, cells: list[Block], **others: Any) -> Found:
-        """The same mesh with more nodes, and other cells in its blocks."""
-        return replace(self, points=points, cells=cells, **others)
 
 
 #: Data of Gmsh files from meshio that do not belong to the mesh.

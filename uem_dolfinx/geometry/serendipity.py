@@ -50,7 +50,7 @@ def completed(found: Found) -> tuple[Found, int]:
             block = replace(block, type=SERENDIPITY[block.type], data=np.concatenate(data, axis=1))
         cells.append(block)
     sets = {name: _with_new(nodes, count, around) for name, nodes in found.point_sets.items()}
-    return found.with_cells(np.concatenate(points), cells, point_sets=sets), count - len(x)
+    return replace(found, points=np.concatenate(points), cells=cells, point_sets=sets), count - len(x)
 
 
 def _with_new(nodes: Ints, count: int, around: list[tuple[Ints, Ints]]) -> Ints:

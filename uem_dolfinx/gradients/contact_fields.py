@@ -69,7 +69,7 @@ def _slopes(at: Any, contact: Contact, m: fem.Function, by_gaps: Array, a: Array
         found.append((np.arange(len(contact.pair.nodes)), -rubbed_along(contact.pair, a)))
     if contact.offset is m:
         own, which = at.equations_of(contact, "its offset")
-        opened, worked = thickened(contact.pair, at.multipliers[which], a)
+        opened, worked = thickened(contact.pair, own, at.multipliers[which], a)
         mine, (_, rows) = contactors_of(own, contact.pair), table_of(contact.pair)
         found.append((own.contactor[mine] - rows.start, (by_gaps[which] * opened - worked)[mine]))
     return found
@@ -87,7 +87,7 @@ def along_field(at: Any, m: fem.Function, change: Array) -> tuple[Array, Array]:
             more = np.zeros(len(whole.nodes))
             more[rows] = change[_entries(at, m, contact)]
             more = more[own.contactor]
-            opened, forces = thickened(contact.pair, at.multipliers[which] * more)
+            opened, forces = thickened(contact.pair, own, at.multipliers[which] * more)
             gaps[which] += opened * more
             pushed = pushed + forces
     return gaps, pushed

@@ -307,7 +307,7 @@ class Linearised:
             gaps[which], pushed = by_section(section, m.parameter, len(own))
             return gaps, pushed
         if m.parameter == "offset":
-            gaps[which], forces = thickened(pair, self.multipliers[which])
+            gaps[which], forces = thickened(pair, own, self.multipliers[which])
             return gaps, forces
         rows, b, pushed = own.P, motion_of(m, config.x[: config.n_owned], entry), np.zeros((config.n_owned, config.gdim))
         there = np.einsum("kg,kg->k", rows.coefficients, config.ask_owners(rows.followed, b))

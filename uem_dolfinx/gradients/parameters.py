@@ -105,25 +105,26 @@ def contactors_of(rows: ContactRows, pair: Interface) -> Bools:
     return np.asarray((rows.contactor >= own.start) & (rows.contactor < own.stop))
 
 
-def thickened(pair: Interface, multipliers: Array, along: Array | None = None) -> tuple[Array, Array]:
+def thickened(pair: Interface, own: ContactRows, multipliers: Array, along: Array | None = None) -> tuple[Array, Array]:
     """Derivatives of gaps ``(m,)`` and residual ``(n_owned, gdim)`` by a contact's offset, in which both are linear (collective).
 
     Args:
         pair: of the contact.
-        multipliers: of the equations of the interface in use ``(m,)``.
+        own: equations of the interface in use.
+        multipliers: of these ``(m,)``.
         along: displacements of the owned nodes ``(n_owned, gdim)``, for the work of the residual of each equation instead ``(m,)``.
     """
     more = THICKER * float(reduced(pair.config.comm, _least_side(pair), op=MPI.MIN))
     before, length = pair.discretisation.setting.offset, pair.whole.kinematics.gap_rows.scale
     try:
-        gap, forces = _gaps_and_forces(pair, multipliers, length, along)
+        gap, forces = _gaps_and_forces(pair, own, multipliers, length, along)
         pair.set_offset(np.full(len(pair.nodes), more) + (0.0 if before is None else before))
         pair.project()
-        other_gap, other_forces = _gaps_and_forces(pair, multipliers, length, along)
+        other_gap, other_forces = _gaps_and_forces(pair, None, multipliers, length, along)
     finally:
         pair.set_offset(before)
         pair.project()
-    return np.where(contactors_of(pair.whole.equations(), pair), other_gap - gap, 0.0) / more, (forces - other_forces) / more
+    return np.where(contactors_of(own, pair), other_gap - gap, 0.0) / more, (forces - other_forces) / more
 
 
 def _least_side(pair: Interface) -> float:
@@ -134,13 +135,20 @@ def _least_side(pair: Interface) -> float:
     return float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).min(initial=pair.config.size))
 
 
-def _gaps_and_forces(pair: Interface, multipliers: Array, length: Array, along: Array | None) -> tuple[Array, Array]:
-    """Gaps of equations ``(m,)`` and contact forces, or their work, see ``thickened``, scaled to another ``length (n,)`` (collective)."""
+def _gaps_and_forces(
+    pair: Interface, own: ContactRows | None, multipliers: Array, length: Array, along: Array | None
+) -> tuple[Array, Array]:
+    """Gaps of equations ``(m,)`` and contact forces, or their work, see ``thickened``, scaled to another ``length (n,)`` (collective).
+
+    ``own``: the equations, if they are known at the present offset.
+    """
     whole, config = pair.whole, pair.config
-    own, rows = whole.equations(), whole.kinematics.gap_rows
+    rows = whole.kinematics.gap_rows
     if isinstance(pair.discretisation, Mortar) and isinstance(whole.kinematics, MortarKinematics):
         rows = pair.discretisation.with_variation(whole.kinematics).gap_rows
         own = rows.select(np.flatnonzero(whole.trial.reserved), whole.trial.active)
+    elif own is None:
+        own = whole.equations()
     multipliers = np.where(contactors_of(own, pair), multipliers, 0.0)
     longer = (rows.scale / length)[own.contactor]
     if along is None:

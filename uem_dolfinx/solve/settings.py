@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from hashlib import blake2b
 from inspect import signature
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from mpi4py import MPI
 
@@ -25,11 +25,12 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import as_law, follows_load, parameters
-from uem_dolfinx.dynamics.inertia import Dynamics
-from uem_dolfinx.dynamics.scheme import newmark
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.given import described
 from uem_dolfinx.restart.numbering import DIGEST
+
+if TYPE_CHECKING:
+    from uem_dolfinx.dynamics.inertia import Dynamics
 
 #: Numbers of a form that are shown.
 #: [format; numbers; -]
@@ -72,8 +73,10 @@ class Settings:
             name = f"contact {i} '{contact.name}'"
             self._usual |= {f"{name}, {what}": str(of_contacts[what]) for what in OF_CONTACTS} | {f"{name}, friction": NONE}
         if dynamics is not None:
+            from uem_dolfinx.dynamics.scheme import newmark
+
             still = " ".join("0" for _ in dynamics.weight_of_one)
-            self._usual |= {"scheme": str(newmark()), "contactors": defaults(Dynamics)["contactors"], "gravity": still}
+            self._usual |= {"scheme": str(newmark()), "contactors": defaults(type(dynamics))["contactors"], "gravity": still}
         history = [f for material in materials for f in vars(material).values() if isinstance(f, fem.Function)]
         for name, form in forms.items():
             if not isinstance(form, ufl.Form):

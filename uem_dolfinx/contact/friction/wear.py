@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
-
-from mpi4py import MPI
+from collections.abc import Callable
 
 import numpy as np
 from dolfinx import fem
@@ -15,7 +12,6 @@ from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.laws.archard import worn_volume
 from uem_dolfinx.contact.laws.law import Field, asked_at
 from uem_dolfinx.contact.mortar.duals import basis_of
-from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -120,21 +116,3 @@ class Wear:
                 self._name,
                 count,
             )
-
-
-def wear_on(pairs: Sequence[Any]) -> bool:
-    """Increase the gaps of all pairs by their depths at the end of the present step; return whether any wear in it (collective).
-
-    Slips of rounding, where all stick, wear nothing.
-    """
-    wearing = [pair for pair in pairs if pair.friction is not None and pair.friction.wear is not None]
-    depths = [pair.friction.worn(pair.trial, pair.committed, pair.kinematics) for pair in wearing]
-    some = any(
-        bool((now - pair.committed.friction.worn > GAP_ROUNDING * pair.config.size).any()) for pair, now in zip(wearing, depths)
-    )
-    if not wearing or not reduced(wearing[0].config.comm, some, op=MPI.LOR):
-        return False
-    for pair, now in zip(wearing, depths):
-        pair.friction.wear.apply(now)
-        pair.project()
-    return True

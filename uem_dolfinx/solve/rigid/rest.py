@@ -8,7 +8,7 @@ geometrically, and the last state is an equilibrium without drag.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx.arrays import AnyArray, Array
-from uem_dolfinx.contact.friction.wear import wear_on
+from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
 from uem_dolfinx.errors import ConvergenceError, FloatingBodyError, UEMError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.log import logger
@@ -101,7 +101,25 @@ def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any, sy
         if rested is None:
             raise error
         history = rested
-    return [*history, *converge()] if along is None and wear_on(problem.interfaces) else history
+    return [*history, *converge()] if along is None and _wear_on(problem.interfaces) else history
+
+
+def _wear_on(pairs: Sequence[Any]) -> bool:
+    """Increase the gaps of all pairs by their depths at the end of the present step; return whether any wear in it (collective).
+
+    Slips of rounding, where all stick, wear nothing.
+    """
+    wearing = [pair for pair in pairs if pair.friction is not None and pair.friction.wear is not None]
+    depths = [pair.friction.worn(pair.trial, pair.committed, pair.kinematics) for pair in wearing]
+    some = any(
+        (now - p.committed.friction.worn).max(initial=0.0) > GAP_ROUNDING * p.config.size for p, now in zip(wearing, depths)
+    )
+    if not wearing or not reduced(wearing[0].config.comm, some, op=MPI.LOR):
+        return False
+    for pair, now in zip(wearing, depths):
+        pair.friction.wear.apply(now)
+        pair.project()
+    return True
 
 
 def _may_rest(problem: Any) -> bool:

@@ -190,7 +190,7 @@ class Exchanges:
         own = (
             sum(w.count for w in violated),
             sum(int(w.enter.sum()) for w in violated),
-            active_here(self._pairs),
+            sum(int(pair.trial.active.sum()) for pair in self._pairs),
             sum(len(p.nodes) for p in self._pairs),
         )
         told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
@@ -381,8 +381,3 @@ def _calm(pair: Interface, which: Bools) -> bool:
 def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:
     """Number of violating contactors over all pairs and ranks (collective)."""
     return int(reduced(pairs[0].config.comm, sum(w.count for w in violated))) if pairs else 0
-
-
-def active_here(pairs: Sequence[Interface]) -> int:
-    """Number of active contactors of this rank."""
-    return sum(int(pair.trial.active.sum()) for pair in pairs)
