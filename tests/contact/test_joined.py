@@ -9,7 +9,6 @@ import gc
 import sys
 import weakref
 from collections import Counter
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,14 +22,13 @@ from uem_dolfinx import compat
 from uem_dolfinx.contact import joining
 from uem_dolfinx.contact.laws.law import as_law
 from uem_dolfinx.contact.pair.member import Member
-from uem_dolfinx.solve import problem as problems
 
 CALLS = ("Allreduce", "allreduce", "Allgather", "allgather", "Alltoall", "Alltoallv", "bcast")
 
 
 def one_by_one(monkeypatch):
     """Let each contact be treated alone."""
-    monkeypatch.setattr(problems, "join_alike", lambda contacts: None)
+    monkeypatch.setattr(joining, "_kind", lambda *of: None)
 
 
 def told(contact):
@@ -362,7 +360,7 @@ def test_friction_that_follows_a_temperature_is_not_joined():
     """Its values are evaluated at each placement, by each contact; Coulomb's that only differ in values are joined."""
 
     def joins(friction):
-        return joining._joins(SimpleNamespace(limits=SimpleNamespace(law=as_law(friction))))
+        return joining._joins(as_law(friction))
 
     assert joins(0.3) and joins(lambda x, t: t * x[0]) and joins(uem.Coulomb(0.2, limit=3.0))
     assert not joins(uem.OfTemperature(lambda x, t, T: 0.1 * T, field=1)) and not joins(uem.Tresca(1.0))

@@ -31,6 +31,12 @@ class OfBothSides(ContactResults):
         """The contact, and its further parts."""
         return [self, *self.further]
 
+    def take_further(self, parts: Sequence[Any]) -> None:
+        """Take its further parts, which then decide about common nodes (collective)."""
+        self.further = parts
+        for part in parts:
+            part.share()
+
     def further_parts_touch(self) -> bool:
         """Whether further parts have active contactors (collective)."""
         active = any(part.pair.trial.active.any() for part in self.further)

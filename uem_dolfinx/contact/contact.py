@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from mpi4py import MPI
@@ -29,7 +30,7 @@ from uem_dolfinx.contact.laws.law import (
 )
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.contact.pair.kinds import kind_of_interface, tie_of
+from uem_dolfinx.contact.pair.kinds import PartsOfPair, heats_of_kind, kind_of_interface, tie_of, wear_of
 from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics
 from uem_dolfinx.contact.warnings.checks import warn_of_slim_tips, warn_of_straight_facets
 from uem_dolfinx.contact.warnings.watch import WatchedContact
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
-    from uem_dolfinx.contact.ties.tie import Tie
 
 #: Default bound on the initial penetration, as part of the model's size.
 #: [convention; the model's size; test_pair.py::test_default_bound_on_the_initial_penetration]
@@ -256,6 +256,14 @@ class Contact(WatchedContact, given.Sealed):
         if known or reduced(self.config.comm, not np.array_equal(value, friction.value), op=MPI.LOR):
             self.pair.set_friction(law, value, known)
 
+    def ramp_friction(self, law: Field | FrictionLaw, known: bool, at: float = 0.0) -> None:
+        """Take friction that depends on the load factor, which is ``at``; ``known`` as in ``take_load`` (collective)."""
+        self._at = at
+        if known:
+            self._friction = law
+        else:
+            self.friction = law
+
     def friction_values(self) -> Array:
         """Friction parameters at this rank's contactors; empty without friction."""
         return np.zeros(0) if self.pair.friction is None else self.pair.friction.value
@@ -319,8 +327,8 @@ class Contact(WatchedContact, given.Sealed):
 
     def attach(
         self, config: Configuration, free: Bools, *, at: float = 0.0, duration: Callable[[], float] | None = None
-    ) -> Interface:
-        """Build the pair of this contact in a problem (collective).
+    ) -> PartsOfPair:
+        """Find what the pair of this contact is made of in a problem, see ``take_pair`` (collective).
 
         Args:
             config: configuration of the displacement.
@@ -330,8 +338,7 @@ class Contact(WatchedContact, given.Sealed):
 
         Raises:
             InputError: if friction depends on the speed of slip, and steps have no duration.
-            TagError: if a tag is empty or of the wrong dimension.
-            SpaceError: if a tag belongs to another mesh.
+            TagError, SpaceError: if a tag is empty, of the wrong dimension, or of another mesh.
             SurfaceError: if contactor and target share nodes, or a rigid target is of another dimension.
             UserFunctionError: from the functions of a rigid target.
             OrientationError: if a target facet lies inside a body.
@@ -353,27 +360,22 @@ class Contact(WatchedContact, given.Sealed):
         of: dict[str, Any] = {"name": self.name}
         of["max_penetration"] = MAX_PENETRATION * config.size if self.max_penetration is None else self.max_penetration
         discretisation, means = self._discretised(nodes, target, free=free, sliding=self.sliding, thickness=thickness)
-        friction = self._sliding_of(nodes, discretisation, free[nodes], duration)
-        tie, kind = self._tie(nodes, discretisation, means, **of), kind_of_interface(self, duration)
-        self._pair, self._offsets = kind(config, nodes, discretisation, friction, tie, **of), None
-        if tie is not None and self.tied != "after":
-            self._pair.project()
-            self._pair.unite()
+        friction = self._sliding_of(nodes, discretisation, duration)
+        tie = self._tie(nodes, discretisation, means, **of)
+        warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
+        kind, heats = kind_of_interface(self, duration), partial(heats_of_kind, self) if self.heats else None
+        alone = partial(kind, config, nodes, discretisation, friction, tie, heats=heats, **of)
+        return PartsOfPair(alone, discretisation, friction, **of)
+
+    def take_pair(self, pair: Interface) -> None:
+        """Take the pair that has been made of its parts; tie it, and set its offsets (collective)."""
+        self._pair, self._offsets = pair, None
+        if pair.tie is not None and self.tied != "after":
+            pair.project()
+            pair.unite()
         if self.adjust and self.tied is not True:
             self._offsets_of_pair().adjust(self.adjust)
         self._set_offset()
-        if self.wears:
-            from uem_dolfinx.contact.friction.wear import Wear
-
-            assert friction is not None
-            how = {"tag": self.contactor, "areas": self.surface, "lower": self._offsets_of_pair().wear, "name": self.name}
-            friction.wear = Wear(config, nodes, self._wear, **how)
-        if self.heats:
-            from uem_dolfinx.contact.pair.kinds import heats_of_kind
-
-            self._pair.heats = heats_of_kind(self)
-        warn_of_straight_facets(config, self.name, [tag for tag in (self.contactor, self.target) if isinstance(tag, Tag)])
-        return self._pair
 
     def _discretised(self, nodes: Indices, target: Target, **how: Any) -> tuple[Discretisation, Mortar | None]:
         """The discretisation, and the means for a tie, see ``Tie`` (collective)."""
@@ -400,9 +402,7 @@ class Contact(WatchedContact, given.Sealed):
         """Whether the contactor wears."""
         return callable(self._wear) or self._wear > 0.0
 
-    def _sliding_of(
-        self, nodes: Indices, discretisation: Discretisation, free: Bools, duration: Callable[[], float] | None
-    ) -> Sliding | None:
+    def _sliding_of(self, nodes: Indices, discretisation: Discretisation, duration: Callable[[], float] | None) -> Sliding | None:
         """Friction of the interface, or None; with wear also for frictionless contact, to accumulate slip (collective)."""
         law = as_law(self.friction)
         value = self._friction_at(law, nodes, self._at)
@@ -418,13 +418,11 @@ class Contact(WatchedContact, given.Sealed):
             )
         return Sliding(
             self.config, nodes, discretisation, law=law, value=np.zeros(len(nodes)) if value is None else value,
-            limits=Limits(lambda at: self.areas_facing(nodes, at, False), duration), free=free, keeps_feet=self.sliding != "finite",
-            value_now=self._friction_now,
+            limits=Limits(lambda at: self.areas_facing(nodes, at, False), duration), keeps_feet=self.sliding != "finite",
+            value_now=self._friction_now, wear=wear_of(self, nodes) if self.wears else None,
         )  # fmt: skip
 
-    def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Tie | None:
-        """Permanent tie or bonds, see ``tie_of``."""
-        return tie_of(self, nodes, discretisation, means, **of)
+    _tie = tie_of  # permanent tie or bonds
 
     def tie(self, reach: float = 0.0) -> None:
         """Tie contactors permanently at their present position, from the next step on; others remain in contact.

@@ -9,23 +9,30 @@ from typing import TYPE_CHECKING, Any
 from uem_dolfinx.arrays import Bools
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
-from uem_dolfinx.contact.laws.law import as_law
+from uem_dolfinx.contact.laws.law import FrictionLaw, as_law
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.friction.sliding import Sliding
     from uem_dolfinx.contact.further.part import FurtherPart
+    from uem_dolfinx.contact.pair.interface import Interface
+    from uem_dolfinx.contact.pair.kinds import PartsOfPair
 
 _orders = count(start=1)
 
 
-def attached(contacts: Sequence[Contact], config: Configuration, free: Bools, clock: dict[str, Any]) -> list[Contact]:
-    """Attach contacts, see ``Contact.attach``; returns these, followed by their further parts (collective)."""
-    for contact in contacts:
-        contact.attach(config, free, **clock)
+def attached(
+    contacts: Sequence[Contact], config: Configuration, free: Bools, clock: dict[str, Any], together: bool
+) -> list[Contact]:
+    """Attach contacts, see ``Contact.attach``, and make their pairs, of alike ones ``together`` or not.
+
+    Returns these contacts, followed by their further parts (collective).
+    """
+    made = [contact.attach(config, free, **clock) for contact in contacts]
+    for contact, pair in zip(contacts, _pairs_of(contacts, made, together)):
+        contact.take_pair(pair)
     refuse_shared_pressures(config, contacts)
     return [*contacts, *(part for contact in contacts for part in _further_parts(contact, config, free, clock))]
 
@@ -53,10 +60,9 @@ def _further_parts(contact: Contact, config: Configuration, free: Bools, clock: 
         from uem_dolfinx.contact.further.edges import edges_of
 
         found += edges_of(contact, config, order)
-    contact.further = found
     for part in found:
-        part.attach(config, free, **clock)
-        part.share()
+        part.take_pair(part.attach(config, free, **clock).alone())
+    contact.take_further(found)
     return found
 
 
@@ -78,44 +84,46 @@ def _plain(contact: Contact) -> bool:
     return not (contact.tied or contact.wears or contact.heats or contact.normal or contact.cohesion or contact.leak)
 
 
-def join_alike(contacts: Sequence[Contact]) -> None:
-    """Join similar contacts during the set-up of a problem (collective).
+def _pairs_of(contacts: Sequence[Contact], made: Sequence[PartsOfPair], together: bool) -> list[Interface]:
+    """Interfaces of contacts; one with a ``Member`` for each of those that are alike, if these are treated ``together`` (collective).
 
-    These are node-to-surface contacts of meshes, or with rigid surfaces, with finite sliding, at degree 1, with the same normals and
-    target thickness, without friction or with Coulomb's law, without ties, wear and heat.
+    Alike are node-to-surface contacts of meshes, or with rigid surfaces, with finite sliding, at degree 1, with the same normals and
+    target thickness, without friction or with Coulomb's law, without further parts, ties, wear and heat.
     """
-    groups: dict[Hashable, list[Contact]] = {}
-    for contact in contacts:
-        kind = _kind(contact)
-        if kind is not None:
-            groups.setdefault(kind, []).append(contact)
+    groups: dict[Hashable, list[int]] = {}
+    for k, (contact, own) in enumerate(zip(contacts, made)):
+        kind = _kind(contact, own) if together else None
+        groups.setdefault(k if kind is None else kind, []).append(k)
+    found: dict[int, Interface] = {}
     for alike in groups.values():
-        if len(alike) > 1:
+        if len(alike) == 1:
+            found[alike[0]] = made[alike[0]].alone()
+        else:
             from uem_dolfinx.contact.pair.joined import JoinedInterface
 
-            own = [contact.pair for contact in alike]
-            for contact, member in zip(alike, JoinedInterface(own).make_members(own)):
-                contact.take_pair(member)
+            parts = [made[k] for k in alike]
+            found |= zip(alike, JoinedInterface(parts).make_members(parts))
+    return [found[k] for k in range(len(contacts))]
 
 
-def _kind(contact: Contact) -> Hashable:
-    """Common properties of contacts that can be joined; None for other contacts."""
+def _kind(contact: Contact, made: PartsOfPair) -> Hashable:
+    """Common properties of contacts that can be treated together; None for other contacts."""
     from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
     from uem_dolfinx.geometry.rigid import RigidSurface
     from uem_dolfinx.geometry.search import MeshTarget
 
-    pair = contact.pair
+    target, friction = made.discretisation.target, made.friction
     rigid = isinstance(contact.target, RigidSurface)
-    if not rigid and not (type(contact) is Contact and type(pair.target) is MeshTarget):
+    if not rigid and not (type(contact) is Contact and type(target) is MeshTarget):
         return None
-    if type(pair.discretisation) is not NodeToSurface or contact.further or contact.sliding != "finite" or not _plain(contact):
+    parted = contact.corners or contact.edges
+    if type(made.discretisation) is not NodeToSurface or parted or contact.sliding != "finite" or not _plain(contact):
         return None
-    if pair.friction is not None and not _joins(pair.friction):
+    if friction is not None and not _joins(friction.limits.law):
         return None
-    return rigid, pair.friction is not None, pair.target.averaged, contact.thickness
+    return rigid, friction is not None, target.averaged, contact.thickness
 
 
-def _joins(friction: Sliding) -> bool:
-    """Whether friction is Coulomb's law, independent of temperature."""
-    law = friction.limits.law
+def _joins(law: FrictionLaw) -> bool:
+    """Whether a law is Coulomb's, independent of temperature."""
     return type(law) is Coulomb and not isinstance(law.field, OfTemperature)

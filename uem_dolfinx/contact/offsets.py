@@ -67,7 +67,8 @@ class Offsets:
             reach: a length; True is a side of a target's facet, or on a rigid surface the bound on the initial penetration.
         """
         pair = self.pair
-        pair.project()
+        if not hasattr(pair, "kinematics"):  # contacts that are treated together are placed together
+            pair.project()
         p, height = pair.kinematics.projection, pair.kinematics.heights()
         most = np.where(np.isfinite(p.facet_size), p.facet_size, pair.max_penetration) if reach is True else reach
         self.adjusted = np.where((np.abs(height) <= most) & ~pair.off, height, 0.0)

@@ -14,6 +14,7 @@ from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.mortar.discretisation import Mortar
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.pair.kinds import PartsOfPair
 from uem_dolfinx.contact.seam.placement import Discretisation
 from uem_dolfinx.contact.ties.preloaded import Preloaded
 from uem_dolfinx.errors import InputError
@@ -154,7 +155,7 @@ class Preload(Contact):
             f"preload '{self.name}' cannot be switched: it carries no force with Step(..., preload={{preload: 0.0}})"
         )
 
-    def attach(self, config: Configuration, free: Bools, **clock: Any) -> Interface:
+    def attach(self, config: Configuration, free: Bools, **clock: Any) -> PartsOfPair:
         """See ``Contact``; in addition (collective).
 
         Raises:
@@ -167,9 +168,12 @@ class Preload(Contact):
                     raise InputError(given.sentence(f"{self._words}: axis", self._axis, "the axis of symmetry, (0, 1)"))
         given.alike(config.comm, self._words, force=self._force, shortening=self._shortening, axis=self._axis)
         self._free = free
-        super().attach(config, free, **clock)
+        return super().attach(config, free, **clock)
+
+    def take_pair(self, pair: Interface) -> None:
+        """See ``Contact``; also sets the force, or the shortening (collective)."""
+        super().take_pair(pair)
         self._take_lead()
-        return self.pair
 
     def _tie(self, nodes: Indices, discretisation: Discretisation, means: Mortar | None, **of: Any) -> Preloaded:
         return Preloaded(
@@ -192,7 +196,22 @@ class Preload(Contact):
         if self._shortening is not None:
             self._section.shorten(self._now("shortening", self._shortening))
         elif self._force is not None:
-            self._section.force = self._now("force", self._force)
+            self._section.pull(self._now("force", self._force))
+
+    def ramp_force(self, force: Callable[[float], float] | None, known: bool) -> None:
+        """Take a force that depends on the load factor from 0 on, or lock with None; ``known`` as in ``take_load`` (collective)."""
+        if force is None and not known:
+            self.lock()
+        elif force is not None:
+            self._at = 0.0
+            if known:
+                self._force, self._shortening = force, None
+            else:
+                self.tighten(force)
+
+    def keep_force(self, at: float) -> None:
+        """Keep the force of a load factor, at the end of a ramp."""
+        self._force = self._force(at) if callable(self._force) else self._force
 
     def _now(self, what: str, of_load: Any) -> float:
         """A number, or the present value of a function of the load factor (collective)."""

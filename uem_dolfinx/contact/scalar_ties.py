@@ -72,7 +72,9 @@ class ScalarTie:
         place[compat.cell_dofs(still.V)] = compat.cell_dofs(config.V)
         number = config.to_global(place)
         movable = config.ask_owners(number[: still.n_owned], free.astype(float)) > 0
-        pair = copy(contact).attach(still, np.repeat(movable, config.gdim, axis=1))
+        alone = copy(contact)
+        alone.take_pair(alone.attach(still, np.repeat(movable, config.gdim, axis=1)).alone())
+        pair = alone.pair
         assert pair.tie is not None and pair.tie.rows is not None
         tie = pair.tie.rows
         contact.taken = True

@@ -16,7 +16,6 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, follows_load
 from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.contact.ties.tie import Tie
 from uem_dolfinx.contact.warnings.checks import check_initial
@@ -58,7 +57,7 @@ def switch_on(contact: Contact) -> None:
     """
     pair = contact.pair
     settle(pair)
-    pair.discretisation.begin_step()
+    pair.whole.discretisation.begin_step()
     pair.project()
     contact.note_overlap(check_initial(pair))
     pair.activate_touching()
@@ -88,8 +87,6 @@ def hold(pair: Interface, free: Bools, changed: Bools | None) -> None:
     if tie is not None and tie.means is not None:
         tie.means.set(free=free)
     own.set(free=free)
-    if pair.friction is not None:
-        pair.friction.free = free[pair.nodes]
     if tied and changed is None:
         # its rows were made with the conditions at the beginning of the script
         pair.from_checkpoint(pair.to_checkpoint())
@@ -117,47 +114,6 @@ def settle(pair: Interface, state: PairState | None = None) -> None:
     """Place the committed state, or another, with the present conditions and offsets (collective)."""
     pair.remember(state or pair.committed)
     pair.project()
-
-
-def take_friction(contact: Contact, law: Field | FrictionLaw, known: bool) -> None:
-    """Set a friction law that depends on the load factor, which starts at 0 (collective).
-
-    Args:
-        contact: with friction of this kind of law.
-        law: see ``blended_friction``.
-        known: whether the committed state belongs to it, at a load factor that is set next.
-
-    Raises:
-        InputError, InputTypeError: as the setter of ``Contact.friction``.
-    """
-    contact._at = 0.0
-    if known:
-        contact._friction = law
-    else:
-        contact.friction = law
-
-
-def leave_friction(contact: Contact, to: Field | FrictionLaw, at: float) -> None:
-    """Freeze friction that was ramped to ``to`` at its value for a load factor."""
-    there = at == 1.0 and not follows_load(as_law(to))
-    contact._friction = to if there else _with_field(contact._friction, _frozen(as_law(contact._friction), at))
-
-
-def take_preload(bolt: Preload, force: Callable[[float], float] | None, known: bool) -> None:
-    """Set a section force that depends on the load factor from 0 on, or lock it with None; ``known`` as above (collective)."""
-    if force is None and not known:
-        bolt.lock()
-    elif force is not None:
-        bolt._at = 0.0
-        if known:
-            bolt._force, bolt._shortening = force, None
-        else:
-            bolt.tighten(force)
-
-
-def leave_preload(bolt: Preload, at: float) -> None:
-    """Freeze the force at its value for a load factor."""
-    bolt._force = bolt._force(at) if callable(bolt._force) else bolt._force
 
 
 def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[[float], float]) -> Field | FrictionLaw:
@@ -208,6 +164,12 @@ def between(a: Field, b: Field, share: float) -> Field:
 def value_at(field: Field, x: Array) -> Any:
     """A number, or the values of a function of position at ``x (3, n)``."""
     return np.asarray(field(x), dtype=float) if callable(field) else field
+
+
+def frozen_friction(contact: Contact, to: Field | FrictionLaw, at: float) -> Field | FrictionLaw:
+    """Friction that was ramped to ``to``, with its value for a load factor."""
+    there = at == 1.0 and not follows_load(as_law(to))
+    return to if there else _with_field(contact.friction, _frozen(as_law(contact.friction), at))
 
 
 def _frozen(law: FrictionLaw, at: float) -> Field:

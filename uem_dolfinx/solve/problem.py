@@ -13,7 +13,7 @@ from uem_dolfinx import given
 from uem_dolfinx.compiled import with_options
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact, parts_of
-from uem_dolfinx.contact.joining import attached, join_alike
+from uem_dolfinx.contact.joining import attached
 from uem_dolfinx.contact.pair.interface import Interface, motions_of
 from uem_dolfinx.contact.warnings.checks import check_moved, check_new
 from uem_dolfinx.contact.warnings.watch import Watch
@@ -201,9 +201,8 @@ class UnitedProblem(given.Sealed):
         rigid = checks.rigid_nodes(self.config, free, couplings if contacts else [])
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
         self.config.equations = equations
-        self.contacts: list[Contact] = attached(parts_of(contacts, self.config, rigid), self.config, free, clock)
-        if method is BodySystem:
-            join_alike(self.contacts)
+        parts = parts_of(contacts, self.config, rigid)
+        self.contacts: list[Contact] = attached(parts, self.config, free, clock, method is BodySystem)
         if dynamics is not None:
             from uem_dolfinx.dynamics.massless import warn_of_soft_targets
 

@@ -41,14 +41,13 @@ class Sliding:
         law: friction law.
         value: parameter of the law at the contactors ``(n,)``.
         limits: limits of the friction forces.
-        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
         keeps_feet: whether closest points are constant during the step.
         value_now: function that returns the parameter ``(n,)`` after a placement, or None if unchanged (collective).
+        wear: of the contactors; None without wear.
 
     Attributes:
         frame: tangential directions and relative motions of the last placement.
         pivot: record of the exchanges in the present linearised problem.
-        wear: of the contactors; None without wear.
         left_out: tangents whose equations are redundant and were dropped ``(n, gdim - 1)``.
         last: the last step's end, for contactors that follow other nodes in a mean; None before a placement.
     """
@@ -64,13 +63,12 @@ class Sliding:
         law: FrictionLaw,
         value: Array,
         limits: Limits,
-        free: Bools,
         keeps_feet: bool,
         value_now: Callable[[Kinematics], Array | None],
+        wear: Wear | None = None,
     ):
-        self.config, self.nodes, self.discretisation, self.free, self.keeps_feet = config, nodes, discretisation, free, keeps_feet
+        self.config, self.nodes, self.discretisation, self.keeps_feet, self.wear = config, nodes, discretisation, keeps_feet, wear
         n, g, self.limits, self._value_now = len(nodes), config.gdim, limits, value_now
-        self.wear: Wear | None = None
         self.set(law, value)
         self.left_out: Bools = np.zeros((n, g - 1), dtype=bool)
         self._other_normals: Array = np.zeros((n, 0, g))
@@ -160,7 +158,7 @@ class Sliding:
     def _at_anchors(self, state: PairState) -> Bools:
         """Contactors that stick to a point of the target and can follow it ``(n,)``."""
         stuck = self.active(state) & _of(state).stick & self.discretisation.traits.pointwise
-        return stuck & (self.free | ~self.frame.ties.moves).all(axis=1)
+        return stuck & (self.discretisation.setting.free[self.nodes] | ~self.frame.ties.moves).all(axis=1)
 
     def bound(self, state: PairState, lam: Array | None = None) -> Array:
         """Limit of the tangential force in a state, or with other normal forces ``lam (n,)``: ``(n,)``."""
@@ -220,7 +218,7 @@ class Sliding:
 
     @property
     def _lost(self) -> Bools:
-        return np.asarray(self.left_out & ~self.free.all(axis=1, keepdims=True))
+        return self.left_out & ~self.discretisation.setting.free[self.nodes].all(axis=1, keepdims=True)
 
     def exchange(
         self,

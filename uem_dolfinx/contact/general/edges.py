@@ -24,7 +24,7 @@ class EdgeContact(OfCrossings, BodiesContact):
 
     def __init__(self, neighbours: Neighbours, crossings: Crossings, number: int, **options: Any):
         super().__init__(neighbours.skin.tag, neighbours.skin.tag, coupling=OfCrossings.kind, **options)
-        self._crossings, self._number, self._skin, self._order = crossings, number, neighbours.skin, neighbours.number
+        self._crossings, self._number, self._order = crossings, number, neighbours.number
 
 
 def crossings_of(neighbours: Neighbours, overlap: float, ridges: bool = False) -> Crossings | None:

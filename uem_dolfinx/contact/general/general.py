@@ -32,7 +32,7 @@ from uem_dolfinx.geometry.tags import Part, Tag, communicator_of
 from uem_dolfinx.parallel import agreed
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.general.pair_friction import FrictionOfPairs
+    from uem_dolfinx.contact.general.pair_friction import FrictionOfPairs, ValuesOfPairs
     from uem_dolfinx.contact.general.touching import Pair, Touch
     from uem_dolfinx.contact.laws.soft import SoftContact
     from uem_dolfinx.geometry.skin import Apart
@@ -165,6 +165,7 @@ class GeneralContact(OfProblem, given.Sealed):
         bound = MAX_PENETRATION * float(skin.extent.min()) if self.max_penetration is None else self.max_penetration
         friction = self.friction if self._pairs is None else self._pairs.law
         options: dict[str, Any] = {"friction": friction, "max_penetration": bound, "measure": self.measure, "normal": self.normal}
+        options |= {"skin": skin, "by_pairs": None if self._pairs is None else self._values_of_pairs}
         with_facets, itself = place[skin.size > 0], np.full(skin.n_bodies, self.self_contact is True)
         for part in () if isinstance(self.self_contact, bool) else self.self_contact:
             itself |= skin.bodies_of(as_part(config, part, "self_contact"))
@@ -192,9 +193,6 @@ class GeneralContact(OfProblem, given.Sealed):
             name = getattr(target, "name", type(target).__name__)
             name += f" {i + 1}" if len(self.rigid) > 1 else ""
             parts.append(RigidContact(surface, target, coupling=self.coupling, name=f"{self.name} on {name}", **options))
-            parts[-1]._skin = skin
-        if self._pairs is not None:
-            self._give_friction(parts)
         self._parts = parts
         return parts
 
@@ -247,14 +245,12 @@ class GeneralContact(OfProblem, given.Sealed):
         """Name of the k-th contact between bodies."""
         return f"{self.name} {k + 1}" if k else self.name
 
-    def _give_friction(self, parts: Sequence[Contact]) -> None:
-        """Set the friction of pairs in the contacts (collective)."""
+    def _values_of_pairs(self, target: Any, name: str) -> ValuesOfPairs:
+        """Friction of pairs in one of the contacts, with a rigid ``target`` or None (collective)."""
         from uem_dolfinx.contact.general.pair_friction import ValuesOfPairs
 
         assert self._pairs is not None
-        for part in parts:
-            target = part.target if isinstance(part, RigidContact) else None
-            part._by_pairs = ValuesOfPairs(self._skin, self._pairs, self._place_of, target, part.name)
+        return ValuesOfPairs(self._skin, self._pairs, self._place_of, target, name)
 
     def _place_of(self, one: Any) -> tuple[Bools, Bools]:
         """Local nodes ``(n_local,)`` and this rank's facets ``(m,)`` of a part, or of a body by its name (collective)."""

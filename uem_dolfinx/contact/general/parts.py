@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -31,13 +32,21 @@ if TYPE_CHECKING:
 
 
 class GeneralPart(Contact):
-    """Base of the parts of a general contact."""
+    """Base of the parts of a general contact.
+
+    Args:
+        sides: contactor and target.
+        skin: joint surface of all bodies.
+        by_pairs: function of the rigid target, or None, and the name of the part that makes its friction by pairs of surfaces.
+        options: see ``Contact``.
+    """
 
     of_all_surfaces = True
-    #: Joint surface of all bodies.
-    _skin: Skin
-    #: Friction by pairs of surfaces.
-    _by_pairs: ValuesOfPairs | None = None
+
+    def __init__(self, *sides: Any, skin: Skin, by_pairs: Callable[[Any, str], ValuesOfPairs] | None = None, **options: Any):
+        super().__init__(*sides, **options)
+        rigid = self.target if hasattr(self.target, "project") else None
+        self._skin, self._by_pairs = skin, None if by_pairs is None else by_pairs(rigid, self.name)
 
     @cached_property
     def surface(self) -> Areas:
@@ -109,8 +118,7 @@ class AmongContact(BodiesContact):
         quadratic = skin.config.degree == 2
         coupling: Any = AmongQuadraticBodies if quadratic else AmongBodies
         super().__init__(skin.tag, skin.tag, coupling=coupling, **options)
-        self._neighbours, self._number, self._skin = neighbours, number, skin
-        self._together, self._crossings = together, crossings
+        self._neighbours, self._number, self._together, self._crossings = neighbours, number, together, crossings
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         from uem_dolfinx.geometry.neighbours import Neighbour
@@ -187,7 +195,7 @@ class MortarContact(BodiesContact):
 
     def __init__(self, contactor: Tag, target: Tag, body: Body, crossings: Crossings | None, order: int, **options: Any):
         super().__init__(contactor, target, coupling="mortar", **options)
-        self._body, self._skin, self._crossings, self._order = body, body.skin, crossings, order
+        self._body, self._crossings, self._order = body, crossings, order
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         return surface_nodes(config, self.contactor), self._body

@@ -53,6 +53,10 @@ class Contactors(OnTarget):
         super().begin_step()
         self.faced = np.zeros((0, 2), np.int64)
 
+    def keep_facing(self, facing: Ints) -> None:
+        """Add pairs of facets that face each other ``(p, 2)``, until the end of the step."""
+        self.faced = np.unique(np.concatenate([self.faced, facing]), axis=0)
+
     def sizes(self, x: Array) -> Array:
         """Areas of the contactor's facets in their planes, with their nodes at ``x (m, nn, gdim)``: ``(m,)``."""
         return Planes.of(self.surface.shape, x, self.surface.sign).size
@@ -153,7 +157,7 @@ class MortarKinematics(PlacedOnTarget):
             covered = np.zeros(of.surface.dofs.shape, dtype=bool)
             if isinstance(of.target, MeshTarget):
                 assert rows.facing is not None
-                of.faced = np.unique(np.concatenate([of.faced, rows.facing]), axis=0)
+                of.keep_facing(rows.facing)
                 covered[rows.facets] = rows.points.duals.kept
             else:
                 covered[rows.facets[rows.points.facet[rows.points.segments.pair]]] = True

@@ -101,8 +101,7 @@ class CohesiveInterface(SofteningInterface):
         now = self._law.respond(w, normal, kept, passed, goes_on)
         share = np.where(self._bonds.rows.share > 0.0, self._bonds.rows.share, 1.0)
         area = self._bonds.bonded_areas(self._contact._areas)[:, None]
-        self._bonds.multipliers = -area * now.traction / share
-        self._bonds.holds = (area[:, 0] > 0.0) & (now.delayed < 1.0)
+        self._bonds.press(-area * now.traction / share, (area[:, 0] > 0.0) & (now.delayed < 1.0))
         self._secant, self._tangent = (
             (area / share)[:, :, None] * part / share[:, None, :] for part in (now.secant, now.tangent)
         )

@@ -5,7 +5,7 @@ The trial state changes in every iteration, the committed state only after conve
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,12 +42,12 @@ class Interface:
         tie: permanent tie of contactors, in addition to contact; None without a tie.
         name: for messages.
         max_penetration: bound on the initial penetration, a length.
+        heats: function of the interface that makes its heat flows, one for each conductance; None without.
 
     Attributes:
         trial: state of the present iteration.
         committed: state of the last step.
         kinematics: of the contactors, for the trial state; available after ``project``.
-        heats: heat flow, one object per conductance.
     """
 
     kinematics: Kinematics
@@ -62,13 +62,15 @@ class Interface:
         *,
         name: str,
         max_penetration: float,
+        heats: Callable[[Any], list[Heat]] | None = None,
     ):
         self.config, self.nodes, self.discretisation, self.friction, self.tie = config, nodes, discretisation, friction, tie
         self.name, self.max_penetration = name, max_penetration
         state = PairState.initial(n := len(nodes), g := config.gdim)
         along, bond = FrictionState.initial(n, g) if friction else None, np.zeros((n, g)) if tie else None
-        self.trial = self.committed = replace(state, friction=along, bond=bond)
-        self.heats: list[Heat] = []
+        self.heats = [] if heats is None else heats(self)
+        united = sum(heat.law.perfect for heat in self.heats)
+        self.trial = self.committed = replace(state, friction=along, bond=bond, heat=np.zeros((n, united)) if united else None)
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
 

@@ -9,10 +9,9 @@ import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.joined_nodes import JoinedNodes, JoinedSliding
+from uem_dolfinx.contact.pair.kinds import PartsOfPair
 from uem_dolfinx.contact.pair.member import Member
 from uem_dolfinx.contact.seam.state import FACETS, OF_FRICTION, FrictionState, PairState
 
@@ -21,7 +20,7 @@ class JoinedInterface(Interface):
     """Several contacts as one interface (collective).
 
     Args:
-        own: interfaces of the contacts, equal except for surfaces, friction values, offsets and penetration bounds.
+        own: what the interfaces of the contacts are made of, equal except for surfaces, friction values and penetration bounds.
 
     Attributes:
         members: access to each of the contacts.
@@ -29,25 +28,21 @@ class JoinedInterface(Interface):
 
     discretisation: JoinedNodes
 
-    def __init__(self, own: Sequence[Interface]):
-        first, ties = own[0], [pair.discretisation for pair in own]
-        nodal = JoinedNodes(ties)  # type: ignore[arg-type]
-        sliding = [pair.friction for pair in own if pair.friction is not None]
+    def __init__(self, own: Sequence[PartsOfPair]):
+        first, nodal = own[0], JoinedNodes([parts.discretisation for parts in own])
+        sliding = [parts.friction for parts in own if parts.friction is not None]
         friction = JoinedSliding(sliding, nodal) if sliding else None
-        super().__init__(first.config, nodal.nodes, nodal, friction, name=first.name, max_penetration=first.max_penetration)
+        super().__init__(nodal.config, nodal.nodes, nodal, friction, name=first.name, max_penetration=first.max_penetration)
         self._members: list[weakref.ref[Member]] = []
-        here, surface = nodal.numbers.here, nodal.surface_of
-        parts = [_renumbered(p.committed, lambda f, s=s: here(f, s)) for p, s in zip(own, surface)]  # type: ignore[misc]
-        self.trial = self.committed = _each(lambda _, *a: np.concatenate(a), *parts)
 
     @property
     def members(self) -> Sequence[Interface]:
         """Members of the contacts."""
         return [one for member in self._members if (one := member()) is not None]
 
-    def make_members(self, own: Sequence[Interface]) -> list[Member]:
+    def make_members(self, own: Sequence[PartsOfPair]) -> list[Member]:
         """Make the members; the caller keeps references to them, and they keep this interface."""
-        members = [Member(self, k, pair) for k, pair in enumerate(own)]
+        members = [Member(self, k, parts) for k, parts in enumerate(own)]
         self._members = list(map(weakref.ref, members))
         return members
 

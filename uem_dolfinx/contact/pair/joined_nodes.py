@@ -52,8 +52,6 @@ class JoinedNodes(NodeToSurface):
         self._own = own
         none = np.zeros(len(own), dtype=bool)
         self.set(far=none, on=~none, mutual=none, label=label)
-        if any(one.offset is not None for one in own):
-            self.set(offset=np.concatenate([np.zeros(len(o.nodes)) if o.offset is None else o.offset for o in own]))
 
     def set(self, **changed: Any) -> None:
         """See ``OnTarget`` (collective)."""
@@ -127,7 +125,6 @@ class JoinedSliding(Sliding):
             law=JoinedLaw([one.limits.law for one in own], label),
             value=np.concatenate([one.value for one in own]),
             limits=Limits(areas, first.limits.duration),
-            free=discretisation.free,
             keeps_feet=first.keeps_feet,
             value_now=lambda kinematics: None,
         )

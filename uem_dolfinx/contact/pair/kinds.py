@@ -1,10 +1,10 @@
-"""Kinds of interfaces, of ties and of heat flows that a contact's laws ask for; they are imported where they are used."""
+"""Kinds of interfaces, ties, heat flows and wear for the laws of a contact; they are imported where they are used."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from uem_dolfinx.arrays import Indices
 from uem_dolfinx.contact.pair.interface import Interface
@@ -12,8 +12,20 @@ from uem_dolfinx.contact.seam.placement import Discretisation
 from uem_dolfinx.errors import InputError
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.friction.wear import Wear
     from uem_dolfinx.contact.thermal.heat import Heat
     from uem_dolfinx.contact.ties.tie import Tie
+
+
+class PartsOfPair(NamedTuple):
+    """What the interface of a contact is made of, ``alone`` or with those of others; other attributes are its arguments."""
+
+    alone: Callable[[], Interface]
+    discretisation: Any
+    friction: Sliding | None
+    name: str
+    max_penetration: float
 
 
 def kind_of_interface(contact: Any, duration: Callable[[], float] | None) -> Callable[..., Interface]:
@@ -52,12 +64,20 @@ def kind_of_interface(contact: Any, duration: Callable[[], float] | None) -> Cal
     return partial(kind, law=law, contact=contact)
 
 
-def heats_of_kind(contact: Any) -> list[Heat]:
-    """Heat flows of a contact, hard or soft; see ``thermal.heat.heats_of`` (collective)."""
+def heats_of_kind(contact: Any, pair: Interface) -> list[Heat]:
+    """Heat flows of a contact's interface, hard or soft; see ``thermal.heat.heats_of`` (collective)."""
     from uem_dolfinx.contact.thermal import heat, soft_heat
 
     kind = heat.Heat if contact.normal is None else soft_heat.SoftHeat
-    return heat.heats_of(contact.pair, contact.heats, contact, kind)
+    return heat.heats_of(pair, contact.heats, contact, kind)
+
+
+def wear_of(contact: Any, nodes: Indices) -> Wear:
+    """Wear of a contact's contactors (collective)."""
+    from uem_dolfinx.contact.friction import wear
+
+    how: dict[str, Any] = {"tag": contact.contactor, "areas": contact.surface, "name": contact.name}
+    return wear.Wear(contact.config, nodes, contact._wear, lower=lambda worn: contact._offsets_of_pair().wear(worn), **how)
 
 
 def tie_of(contact: Any, nodes: Indices, discretisation: Discretisation, means: Any, **of: Any) -> Tie | None:

@@ -12,6 +12,7 @@ from uem_dolfinx.contact.laws.law import FrictionLaw
 from uem_dolfinx.contact.nodes.node_to_surface import NodalKinematics
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.joined_nodes import JoinedLaw
+from uem_dolfinx.contact.pair.kinds import PartsOfPair
 from uem_dolfinx.contact.pair.tables import label_of
 from uem_dolfinx.contact.seam.corners import Corners
 from uem_dolfinx.contact.seam.placement import Kinematics
@@ -25,13 +26,13 @@ class Member(Interface):
     Args:
         whole: the ``JoinedInterface``.
         k: number of the contact.
-        own: its original interface, with its own target.
+        own: what its interface alone would be made of, with its own target.
     """
 
-    def __init__(self, whole: Any, k: int, own: Interface):
+    def __init__(self, whole: Any, k: int, own: PartsOfPair):
         self.joined, self._k, self._rows = whole, k, whole.discretisation.rows_of[k]
-        self.config, self.nodes, self.discretisation, self.friction = own.config, own.nodes, own.discretisation, own.friction
-        self.name, self.max_penetration, self.tie, self.heats = own.name, own.max_penetration, None, []
+        _, nodal, self.friction, self.name, self.max_penetration = own
+        self.discretisation, self.config, self.nodes, self.tie, self.heats = nodal, nodal.config, nodal.nodes, None, []
         #: The last kinematics, and the last trial state, of all contacts that were looked at, and their parts.
         self._known: tuple[Kinematics, Kinematics] | None = None
         self._seen: tuple[PairState, PairState] | None = None

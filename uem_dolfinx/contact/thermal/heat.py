@@ -12,7 +12,7 @@ constraint ``v_i' T = 0``: one unknown of each touching contactor is eliminated,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from mpi4py import MPI
@@ -32,7 +32,7 @@ from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.fields import ConfigurationAmongFields
 from uem_dolfinx.geometry.nodal_fields import NodalField, nodal_field
-from uem_dolfinx.geometry.projection import Projection, Target
+from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
@@ -63,10 +63,6 @@ class Pair(Protocol):
     @property
     def target(self) -> Target:
         """Target of the contactors."""
-
-    @property
-    def projection(self) -> Projection:
-        """Projection of the contactors in the last placement."""
 
     @property
     def united(self) -> Bools:
@@ -426,14 +422,12 @@ class Heat:
 
 
 def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared, kind: type[Heat]) -> list[Heat]:
-    """Heat flows of an interface by several conductances; adds columns for perfect ones to its state (collective).
+    """Heat flows of an interface by several conductances (collective).
 
     Raises:
         InputError, SpaceError: as ``Heat``.
     """
     columns = np.cumsum([law.perfect for law in laws])
-    if columns[-1]:
-        pair.trial = pair.committed = replace(pair.committed, heat=np.zeros((len(pair.nodes), columns[-1])))
     heats = [kind(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
     for heat in heats:
         if heat.law.joule is not None:

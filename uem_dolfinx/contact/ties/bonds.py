@@ -97,6 +97,10 @@ class Bonds(Tie):
         r = gradient.reshape(len(which), g, nodes.shape[1] * g)
         return nodes, np.einsum("kca,kcd,kdb->kab", r, tangent[which], r, optimize=True)
 
+    def press(self, multipliers: Array, holds: Bools) -> None:
+        """Set the forces of the bonds, and which of them hold bodies; see the attributes."""
+        self.multipliers, self.holds = multipliers, holds
+
     def with_forces(self, contact: Traction, equations: ContactRows, multipliers: Array) -> Traction:
         """Contact forces, with those of the bonds (collective)."""
         if self.rows is None:

@@ -245,6 +245,10 @@ class Preloaded(Tie):
         """Lock the opening that shortens the bolt by a ``length``."""
         self.locked, self.shortened, self.opening, self._here = True, True, -length, None
 
+    def pull(self, force: float) -> None:
+        """Set the force, which acts while the opening is free."""
+        self.force = force
+
     def put(self, force: float, locked: bool, shortened: bool, opening: float) -> None:
         """Set force and opening of a recorded step."""
         self.force, self.locked, self.shortened, self.opening, self._here = force, locked, shortened, opening, None

@@ -21,7 +21,6 @@ from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.offsets import Offsets
-    from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.seam.state import PairState
     from uem_dolfinx.contact.warnings.confined import Confined
     from uem_dolfinx.contact.warnings.edges_inside import EdgesInside, Meeting
@@ -60,12 +59,6 @@ class WatchedContact(OfBothSides):
     def note_overlap(self, overlaps: Mapping[int, float]) -> None:
         """Take its own of initial penetrations, see ``check_initial``."""
         self._overlap = overlaps.get(id(self.pair), self._overlap)
-
-    def take_pair(self, pair: Interface) -> None:
-        """Replace the interface of the contact."""
-        self._pair = pair
-        if self._offsets is not None:
-            self._offsets.pair = pair
 
     @property
     def adjusted(self) -> float:

@@ -18,16 +18,13 @@ from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.contact.switched import (
     between,
     blended_friction,
+    frozen_friction,
     hold,
-    leave_friction,
-    leave_preload,
     mark,
     refuse_ramp,
     settle,
     switch_off,
     switch_on,
-    take_friction,
-    take_preload,
 )
 from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
@@ -138,7 +135,7 @@ class Stage:
         starts = self._take_loads(fresh)
         known = not fresh
         for contact, value in step.friction.items():
-            take_friction(contact, blended_friction(contact, value, self._share), known)
+            contact.ramp_friction(blended_friction(contact, value, self._share), known)
         #: Offsets at the beginning of the step.
         self._offsets = {contact: contact.offset for contact in step.offset}
         problem.stage = self
@@ -229,7 +226,7 @@ class Stage:
         ramps = [ramp(start, end) for start, end in zip(starts, [*constants.values(), *bolts.values()])]
         problem.load = dict(zip(constants, ramps)) if constants else check_load(loads)
         for (bolt, force), follows in zip(bolts.items(), ramps[len(constants) :]):
-            take_preload(bolt, None if force is None else follows, not fresh)
+            bolt.ramp_force(None if force is None else follows, not fresh)
         return starts
 
     def led(self, at: float) -> Iterator[tuple[Any, float]]:
@@ -254,6 +251,6 @@ class Stage:
         problem = self._problem
         problem.load = problem.stage = None
         for contact, value in self.step.friction.items():
-            leave_friction(contact, value, self._at)
+            contact.ramp_friction(frozen_friction(contact, value, self._at), True, self._at)
         for bolt in self.step.preload:
-            leave_preload(bolt, self._at)
+            bolt.keep_force(self._at)

@@ -89,7 +89,8 @@ def time_steps(
     chosen = is_explicit(dynamics) and dt is None
     with agreed(problem.comm):
         dt = dt if chosen else given.number("dt", dt, given.POSITIVE)
-        end = given.number("end", end, _not_before(dynamics.start))
+        later = given.Range(f"a time that is not before the start, {dynamics.start:.6g}", lambda t: dynamics.start <= t < np.inf)
+        end = given.number("end", end, later)
         if is_explicit(dynamics) and event_tolerance is not None:
             raise InputError("event_tolerance is for implicit schemes: leave it out, since explicit steps are short")
         if is_explicit(dynamics) and tolerance is not None:
@@ -271,8 +272,10 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
 def _bar_returned(pair: Interface) -> int:
     """Exclude contactors that had sunk past the target's end and re-entered in this step; return their number (collective)."""
     came = pair.trial.active & ~pair.committed.active & pair.committed.passed
-    pair.committed = replace(pair.committed, barred=pair.committed.barred | came)
-    return int(reduced(pair.config.comm, int(came.sum())))
+    count = int(reduced(pair.config.comm, int(came.sum())))
+    if count:
+        pair.remember(replace(pair.committed, barred=pair.committed.barred | came))
+    return count
 
 
 def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
@@ -290,11 +293,6 @@ def _held_by(problem: UnitedProblem, forces: list[Array]) -> float:
     pressed = np.logical_or.reduce([f != 0.0 for f in forces])
     held += 0.5 * float(K.ravel()[pressed].sum()) * open_still**2
     return float(reduced(problem.comm, held))
-
-
-def _not_before(start: float) -> given.Range:
-    """Range of valid end times."""
-    return given.Range(f"a time that is not before the start, {start:.6g}", lambda t: start <= t < np.inf)
 
 
 def _rounding(dynamics: Dynamics, dt: float, end: float) -> float:
