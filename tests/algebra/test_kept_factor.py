@@ -201,6 +201,7 @@ def solves_of(config, K, pc, values):
     found = kept.solve(P, K, None, P, rhs, 1e-10)
     if found is not None:
         assert np.abs(found[0].array * diagonal.array - 1.0).max() < 1e-9
+        assert kept.cheap == (found[1] <= 8)
     return None if found is None else found[1]
 
 

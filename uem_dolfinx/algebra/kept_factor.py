@@ -54,6 +54,8 @@ class KeptFactor(Returning):
         self.space = space
         self._pc: Any = None
         self._most = MOST_SOLVES
+        #: Whether the last solve was much cheaper than a factorisation may be.
+        self.cheap = True
         #: Mask of the used columns of P, the diagonal of K, and whether Q is P.
         self._made_with: Any = None
 
@@ -97,7 +99,8 @@ class KeptFactor(Returning):
         dq.set(0.0)
         with timed("linear solve"):
             ksp.solve(rhs, dq)
-        found = (dq, int(ksp.getIterationNumber())) if ksp.getConvergedReason() > 0 else None
+        solves = int(ksp.getIterationNumber())
+        self.cheap, found = solves <= MOST_SOLVES, (dq, solves) if ksp.getConvergedReason() > 0 else None
         if found is not None and Q is not P and (ksp.computeEigenvalues().real < 0.0).any():
             found = None
         # otherwise P would be kept alive

@@ -107,8 +107,8 @@ class UnitedSolver(KspOfOptions):
 
     @property
     def cheap(self) -> bool:
-        """Whether solves for another active set need no factorisation."""
-        return self.iterative or self._on_condensed or self._served is not None
+        """Whether solves for another active set need no factorisation, and few solves by an earlier one."""
+        return self.iterative or self._on_condensed or (self._served is not None and self._kept.cheap)
 
     def set_operator(
         self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, roughly: bool = False
