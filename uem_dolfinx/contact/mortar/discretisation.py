@@ -183,7 +183,7 @@ class Mortar(Contactors):
         rows = less(offsets := self._offsets(facets))
         if self.of_gaps or self.sliding != "finite":
             # areas do not grow with gaps: the derivatives are those of gaps that are closed in the mean
-            heights = config.from_owners(self.nodes, self.heights(rows)[:, None], dofs.ravel()).reshape(dofs.shape)
+            heights = self.heights_of_facets(rows)
             rows = less(heights if offsets is None else heights + offsets).at_gaps(rows.plain.gap)
         return replace(rows, facing=facing)
 

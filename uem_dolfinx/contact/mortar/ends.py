@@ -15,7 +15,7 @@ The position of the target's boundary on the contactor facet, the gap there, c a
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -106,7 +106,7 @@ class _Ends:
             half += self._at_cuts(at.sides(self.other, which, cuts=True).at_ends())
         e = at.facet[which]
         nodes = np.concatenate([at.nodes[e], at.opposite[which]], axis=1)
-        return [(nodes, half + half.transpose(0, 2, 1)), self._in_the_mean(sides)]
+        return [(nodes, half + half.transpose(0, 2, 1)), *self._in_the_mean(sides)]
 
     def _factors(self, e: Ints, s: Sides) -> tuple[Array, Array, Array, Array]:
         """At points on facets ``e (q,)``: ``l_f + w . b``, h ``(q,)``, dh/db ``(q, nc)``, and ``g - b . c`` ``(q,)``."""
@@ -129,13 +129,18 @@ class _Ends:
         e = at.facet[self.which[s.pair]]
         n, size = at.planes.normal[e], at.planes.size[e]
         press, h, with_b, _ = self._factors(e, s)
-        v, grown = -s.way, s.motions.of_area(n / size[:, None])
-        # gaps change by the motion of the target's point there, and its side moves as the chord does
-        there = replace(s.motions, N=s.N, part=s.gap / size)
-        rise = 2 * there.along(s.t) - s.motions.along(s.t + n) + 2 * s.gap[:, None, None] * grown
         # points on the contactor facet, and derivatives of the functions there
         tab = at.shape.tabulate(s.xi)
-        over = dual_tangents(tangents(tab, at.x[e]), n)
+        tangent = tangents(tab, at.x[e])
+        over = dual_tangents(tangent, n)
+        v, grown = -s.way, s.motions.of_area(n / size[:, None])
+        if at.unequal:
+            grown[:, : s.motions.nc] += at.stretching_at(e, tab)
+        steep, high = (np.einsum("qfg,qg->qf", tangent, direction) for direction in (s.t, n))
+        rise, sinks = 2 * s.gap_changes(n, size), s.motions.along(n)
+        for f in range(at.shape.dim):
+            goes = -s.motions.along(over[:, f])
+            rise, sinks = rise + steep[:, f, None, None] * goes, sinks + high[:, f, None, None] * goes
         if at.offsets is not None:
             for f, slope in enumerate(np.einsum("qaf,qa->fq", tab.dN, at.offsets[e])):
                 rise = rise + slope[:, None, None] * s.motions.along(over[:, f])
@@ -155,20 +160,18 @@ class _Ends:
             spread = np.zeros(v.shape)
             spread[:, : s.motions.nc] = tab.dN[:, :, f, None] * s.outward[:, None]
             half -= sum_of_products(s.pair, weight, spread, goes, k)
-        sinks = s.motions.along(n) / size[:, None, None]
-        half += sum_of_products(s.pair, weight, sinks, s.motions.of_area(s.outward), k)
+        half += sum_of_products(s.pair, weight / size, sinks, s.motions.of_area(s.outward), k)
         if at.shape.dim == 1:
             return half
         # rotation of sides; area vectors are bilinear
         along = np.einsum("qfg,qg->qf", over, s.ahead)
-        step = Motions(
-            np.einsum("qaf,qf->qa", tab.dN, along), s.shift, np.einsum("qg,qg->q", s.t, s.ahead) / size, s.motions.turning
-        )
+        climb = np.einsum("qa,qag,qg->q", s.shift, at.y[self.which[s.pair]], n) - np.einsum("qf,qf->q", high, along)
+        step = Motions(np.einsum("qaf,qf->qa", tab.dN, along), s.shift, climb / size, s.motions.turning)
         half += sum_of_products(s.pair, 0.5 * weight, s.motions.along(s.outward), step.along(s.ahead), k)
         half -= sum_of_products(s.pair, 0.5 * weight, s.motions.along(s.ahead), step.along(s.outward), k)
         ring = ring_of(at.shape)
         c, g = len(ring), n.shape[1]
-        vector = add_up(s.pair, (at.sign[e] * weight * s.gap / size)[:, None] * s.outward, k)
+        vector = add_up(s.pair, (at.sign[e] * weight * s.motions.part)[:, None] * s.outward, k)
         bent = half.reshape(k, v.shape[1], g, v.shape[1], g)
         bent[:, :c, :, :c] += 0.25 * ring[None, :, None, :, None] * skew(vector)[:, None, :, None, :]
         return half
@@ -179,7 +182,7 @@ class _Ends:
         _, h, _, _ = self._factors(e, s)
         return sum_of_products(s.pair, 0.5 * s.weight * h, -s.way, -s.motions.along(s.cut), len(self.which))
 
-    def _in_the_mean(self, s: Sides) -> tuple[Ints, Array]:
+    def _in_the_mean(self, s: Sides) -> Iterator[tuple[Ints, Array]]:
         """Terms through c and w, which couple all opposite facets of a contactor facet."""
         at, which, k = self.at, self.which, len(self.which)
         nc, nt, g = at.nodes.shape[1], at.opposite.shape[1], at.x.shape[2]
@@ -189,29 +192,45 @@ class _Ends:
         _, _, _, left = self._factors(e, s)
         wb = np.einsum("qb,qb->q", w[e], s.b)
         v = (-s.way * s.weight[:, None, None]).reshape(len(e), 1, width)
-        z = add_up(s.pair, (((more[e] - wb[:, None]) * s.b)[:, :, None] * v).reshape(len(e), nc * width), k)
-        y = add_up(s.pair, ((s.b * left[:, None])[:, :, None] * v).reshape(len(e), nc * width), k)
+        z, ends = (
+            add_up(s.pair, (values[:, :, None] * v).reshape(len(e), nc * width), k).reshape(k, nc, width)
+            for values in ((more[e] - wb[:, None]) * s.b, s.b * left[:, None])
+        )
         # derivative of the gap's projection inside
         place = np.full(len(at.facet), -1, dtype=np.int64)
         place[which] = np.arange(k)
-        q = np.flatnonzero(place[at.segments.pair] >= 0)
+        inner = place[at.segments.pair] >= 0
+        q = np.flatnonzero(inner)
         pair = place[at.segments.pair[q]]
         f = at.facet[which[pair]]
         n, size, gap = at.planes.normal[f], at.planes.size[f], at.segments.gap[q]
         inside = Motions(at.phi[q], at.N[q], gap / size, at.turning[f])
         change = inside.along(at.to_gap[q]) + inside.of_area((gap / size)[:, None] * n)
         weighted = (at.segments.weight[q, None] * at.b[q])[:, :, None] * change.reshape(len(q), 1, width)
-        y += add_up(pair, weighted.reshape(len(q), nc * width), k)
-        z, y = z.reshape(k, nc, width), y.reshape(k, nc, width)
+        y = ends + add_up(pair, weighted.reshape(len(q), nc * width), k).reshape(k, nc, width)
         facet = at.facet[which]
-        here = np.flatnonzero(z.any(axis=(1, 2)))
+        if at.unequal:
+            # parts that do not grow alike change the mean as ends do: once for each facet
+            _, _, means, moved = at.stretched_means(inner, self.pressure)
+            first, grown = np.unique(facet, return_index=True)[1], np.zeros((k, nc, width))
+            y[first, :, : nc * g] += moved[facet[first]]
+            grown[first, :, : nc * g] = means[facet[first]]
+            yield self._of_pairs(grown, ends)
+        yield self._of_pairs(z, y)
+
+    def _of_pairs(self, left: Array, right: Array) -> tuple[Ints, Array]:
+        """Products of changes ``(p, nc, (nc + nt) gdim)`` of all pairs of a contactor facet, with what they have in common."""
+        at, which, facet = self.at, self.which, self.at.facet[self.which]
+        nc, nt, g = at.nodes.shape[1], at.opposite.shape[1], at.x.shape[2]
+        here = np.flatnonzero(left.any(axis=(1, 2)))
         i, j = np.nonzero(facet[here, None] == facet[None, :])
         i = here[i]
         left_part, right_part = np.zeros((2, len(i), nc, nc + 2 * nt, g))
-        left_part[:, :, : nc + nt] = z[i].reshape(len(i), nc, nc + nt, g)
-        own = y[j].reshape(len(i), nc, nc + nt, g)
+        left_part[:, :, : nc + nt] = left[i].reshape(len(i), nc, nc + nt, g)
+        own = right[j].reshape(len(i), nc, nc + nt, g)
         right_part[:, :, :nc], right_part[:, :, nc + nt :] = own[:, :, :nc], own[:, :, nc:]
         wide = (nc + 2 * nt) * g
-        half = left_part.reshape(-1, nc, wide).transpose(0, 2, 1) @ at.duals.inverse[facet[i]] @ right_part.reshape(-1, nc, wide)
+        parts = (part.reshape(len(i), nc, wide) for part in (left_part, right_part))
+        half = next(parts).transpose(0, 2, 1) @ at.duals.inverse[facet[i]] @ next(parts)
         nodes = np.concatenate([at.nodes[facet[i]], at.opposite[which[i]], at.opposite[which[j]]], axis=1)
         return nodes, half + half.transpose(0, 2, 1)

@@ -97,17 +97,28 @@ class Contactors(OnTarget):
         now, then = (self.elimination.seam.sums(self.config.to_owners(dofs.ravel(), own.ravel()))[self.nodes] for own in shares)
         return np.where(then > 0, now / np.where(then > 0, then, 1.0), 1.0)
 
+    def means_on(self, rows: WeightedRows, dofs: Indices) -> Array:
+        """Means of the gaps, weighted with dual functions, at the nodes of facets ``dofs (m, nn)`` (collective)."""
+        means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
+        return self.config.from_owners(self.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
+
     def heights(self, rows: WeightedRows) -> Array:
         """Nodal heights whose means, weighted with dual functions, equal the means of the gaps (collective).
 
         At degree 2 they are first computed in the Bernstein basis, and then converted to nodal values.
         """
         dofs = self.surface.dofs
-        means = np.where(rows.covered, rows.plain.gap / np.where(rows.covered, rows.share, 1.0), rows.plain.gap)
-        at = self.config.from_owners(self.nodes, means[:, None], dofs.ravel()).reshape(dofs.shape)
-        nodal = at @ np.linalg.inv(self.basis.T).T
+        nodal = self.means_on(rows, dofs) @ np.linalg.inv(self.basis.T).T
         total, count = (self.config.to_owners(dofs.ravel(), values.ravel()) for values in (nodal, np.ones(dofs.shape)))
         return np.asarray(total[self.nodes] / count[self.nodes])
+
+    def heights_of_facets(self, rows: WeightedRows) -> Array:
+        """The same of each facet with rows ``(m, nn)``, also where dual functions are added to the foremost one (collective)."""
+        duals, means = rows.points.duals, self.means_on(rows, self.surface.dofs[rows.facets])
+        own: Bools = duals.own.copy()
+        own[np.arange(len(own)), duals.foremost] = True
+        fore = np.take_along_axis(means, duals.foremost[:, None], axis=1)
+        return np.asarray(np.where(own, means, fore) @ np.linalg.inv(self.basis.T).T)
 
 
 @dataclass(frozen=True)
@@ -215,10 +226,16 @@ class MortarKinematics(PlacedOnTarget):
         of, rows, at = self.of, self.rows, self.rows.points
         on_facet, on_target = at.area_derivatives(of.growth(rows.facets, at.x))
         terms = terms_of(at.nodes, at.nodes, on_facet), terms_of(at.nodes[at.facet], at.opposite, on_target)
-        shares = terms_of(at.nodes, at.nodes, of.share_slopes(rows.facets, at.x)[1])
+        full, slopes = of.share_slopes(rows.facets, at.x)
+        shares, whole_area = (
+            terms_of(at.nodes, at.nodes, slopes),
+            of.elimination.total(at.nodes.ravel(), full.reshape(-1, 1))[:, 0],
+        )
+        # functions that are added to the foremost one are part of its area
+        ratio = rows.area * rows.sharing / np.where(rows.covered, whole_area, 1.0)
         covered, whole = (Gradients(*of.elimination.at_owners(parts, np.ones(len(pressure)))) for parts in (terms, [shares]))
         gaps, scale = self.gap_rows.gradients, pressure * rows.length / rows.share
-        return [dyads(scale, covered, gaps), dyads(scale * rows.ratio, gaps, whole)]
+        return [dyads(scale, covered, gaps), dyads(scale * ratio, gaps, whole)]
 
     def pressure_map(self, current: bool) -> PressureMap:
         """Multipliers are current pressures with finite sliding, and forces over kept areas with small and fixed sliding (collective)."""

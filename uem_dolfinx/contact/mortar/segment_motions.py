@@ -91,15 +91,22 @@ class Sides:
     weight: Array
     end: Bools
 
+    def gap_changes(self, n: Array, size: Array) -> Array:
+        """Derivatives of the gaps, with normals ``(q, gdim)`` and sizes ``(q,)`` of the contactor facets ``(q, nc + nt, gdim)``."""
+        part = self.gap / size
+        fixed = Motions(self.motions.phi, self.N, part, self.motions.turning)
+        return fixed.along(self.t) + fixed.of_area(part[:, None] * n)
+
     def at_ends(self) -> Sides:
         """Points where the target ends."""
-        return self._take(self.end)
+        return self.take(self.end)
 
     def between(self) -> Sides:
         """Points between two target facets."""
-        return self._take(~self.end)
+        return self.take(~self.end)
 
-    def _take(self, which: Bools) -> Sides:
+    def take(self, which: Bools) -> Sides:
+        """Some of the points."""
         return Sides(*(getattr(self, f.name)[which] for f in fields(self)))
 
 

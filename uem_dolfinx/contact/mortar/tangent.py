@@ -10,7 +10,8 @@ An offset is part of what is open, and of no height: areas grow with gaps less i
 
 Where a segment ends at a side between two target facets, gaps are continuous but their slopes are not: the motion of this side counts
 in the second derivatives. The ends of the target move too, and dual functions with them (``mortar_ends``). Parts of quadratic
-facets do not all grow as these do, and change dual functions as ends do; second derivatives have what is of first order in them.
+facets do not all grow as these do, and change dual functions as ends do. Their sides may be no chords, at which segments end: gaps of
+two target facets differ there. Contactor's sides that are no chords in its plane, as of tetrahedra, are treated as such.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.mortar.duals import Covered, Duals, add_up, basis_of, products
 from uem_dolfinx.contact.mortar.segment_motions import (
     Motions,
@@ -118,19 +119,27 @@ class SegmentPoints:
 
         Of affine facets all parts grow alike, but for circles.
         """
-        e = self.facet[self.segments.pair]
-        tab, x, n = self.shape.tabulate(self.segments.xi), self.x[e], self.planes.normal[e]
-        over = dual_tangents(tangents(tab, x), n)
-        turned = (to_gap(area_vectors(tab, x), n) + 2 * n) / self.planes.size[e, None]
-        grown = np.asarray(tab.dN @ over - (turned[:, None, None] @ self.turning[e])[:, :, 0])
+        grown = self.stretching_at(self.facet[self.segments.pair], self.shape.tabulate(self.segments.xi))
         if self.radius is not None:
             grown[:, :, 0] += self.phi / self.radius[:, None]
         return grown
+
+    def stretching_at(self, e: Ints, tab: Tabulated) -> Array:
+        """The same at points of facets ``e (q,)`` with shape functions ``tab``, without that of circles."""
+        x, n = self.x[e], self.planes.normal[e]
+        over = dual_tangents(tangents(tab, x), n)
+        turned = (to_gap(area_vectors(tab, x), n) + 2 * n) / self.planes.size[e, None]
+        return np.asarray(tab.dN @ over - (turned[:, None, None] @ self.turning[e])[:, :, 0])
 
     @property
     def unequal(self) -> bool:
         """Whether parts of facets do not grow as these do."""
         return self.shape.degree == 2 or self.radius is not None
+
+    @property
+    def curved_sides(self) -> bool:
+        """Whether sides between target facets may be no chords."""
+        return self.other is not None and self.other.dim == self.other.degree == 2
 
     def area_derivatives(self, growth: Array) -> tuple[Array, Array]:
         """Derivatives of the dual functions' areas, from those of facets' sizes ``(m, nc, gdim)``; shapes as of ``gap_derivatives``."""
@@ -185,13 +194,18 @@ class SegmentPoints:
             stretched = products(grown, self.stretching.reshape(len(grown), nc * g))
             by_node += add_up(e[s.pair], stretched, m).reshape(by_node.shape)
         if self.other is not None:
-            self._add_ends(self.other, by_node, by_pair)
+            self._add_sides(self.other, by_node, by_pair)
         return by_node, by_pair
 
-    def _add_ends(self, shape: FacetShape, on_facet: Array, on_target: Array) -> None:
-        """Add derivatives of weighted gaps at ends of the target, with facets of this ``shape``, over contactor facets."""
-        which = self.partly_covered()
-        sides = self.sides(shape, which).at_ends()
+    def _add_sides(self, shape: FacetShape, on_facet: Array, on_target: Array) -> None:
+        """Add derivatives of weighted gaps at sides of the target's facets, of this ``shape``, over contactor facets: at its ends.
+
+        Between curved facets too, whose gaps differ on the chords at which segments end.
+        """
+        some = self.partly_covered()
+        which = np.arange(len(self.facet)) if self.curved_sides else some
+        sides = self.sides(shape, which)
+        sides = sides.take(~sides.end | np.isin(which, some)[sides.pair]) if self.curved_sides else sides.at_ends()
         e = self.facet[which][sides.pair]
         force = sides.weight[:, None] * self.duals.at_end(e, sides.b, sides.gap - sides.offset)
         way = -force[:, :, None, None] * sides.way[:, None]
@@ -232,8 +246,13 @@ class SegmentPoints:
             for slide, change in self._slides(motions, self.other, tab, self.y[pressing][pair], n[pair], t):
                 half += sum_of_products(pair, force, slide, change, k)
             sides = self.sides(self.other, pressing).between()
-            step = np.einsum("qb,q...b,q->q...", sides.b, amount[sides.pair], sides.weight * sides.slope)
-            half -= 0.5 * sum_of_products(sides.pair, step, sides.way, sides.way, k)
+            step = np.einsum("qb,q...b,q->q...", sides.b, amount[sides.pair], sides.weight)
+            slope = (step.T * sides.slope).T
+            if self.curved_sides:
+                half -= sum_of_products(sides.pair, step, sides.gap_changes(n[sides.pair], size[sides.pair]), sides.way, k)
+                half += 0.5 * sum_of_products(sides.pair, slope, sides.way, sides.way, k)
+            else:
+                half -= 0.5 * sum_of_products(sides.pair, slope, sides.way, sides.way, k)
         elif self.shape_operator is not None:
             # pairs correspond to facets, with points in their order
             shape_operator = self.shape_operator[np.isin(self.segments.pair, pressing)]
@@ -260,16 +279,66 @@ class SegmentPoints:
     def _stretched(self, pressing: Ints, pair: Ints, pressure: Array, gaps: Array) -> Array:
         """Half of the second derivatives with the parts of the plane that points stand for and with their ``gaps (q, nc + nt, gdim)``."""
         q, e, k = np.isin(self.segments.pair, pressing), self.facet[pressing], len(pressing)
-        weight, b, grown = self.segments.weight[q], self.b[q], self.stretching[q]
-        (m, nc), width = self.nodes.shape, gaps.shape[1] * gaps.shape[2]
-        of_gap, of_mean = self.duals.spread(e[pair], b, pressure[:, :, None])
-        rows = grown.shape[1] * grown.shape[2]
+        weight, b, grown, nc = self.segments.weight[q], self.b[q], self.stretching[q], self.nodes.shape[1]
+        width, rows = gaps.shape[1] * gaps.shape[2], grown.shape[1] * grown.shape[2]
+        of_gap, force, means, moved = self.stretched_means(q, pressure)
         out = np.zeros((k, width, width))
         flat, weighted = gaps.reshape(-1, width), weight[:, None] * grown.reshape(-1, rows)
-        out[:, :rows] = add_up(pair, products(weighted * of_gap, flat), k).reshape(k, rows, width)
-        means = add_up(e[pair], products(weighted, of_mean[:, :, 0]), m).reshape(m, rows, nc)
+        out[:, :rows] = add_up(pair, products(weighted * of_gap[:, None], flat), k).reshape(k, rows, width)
         projected = add_up(pair, products(weight[:, None] * b, flat), k).reshape(k, nc, width)
-        out[:, :rows] += (means @ self.duals.inverse)[e] @ projected
+        # once for each facet
+        _, first = np.unique(e, return_index=True)
+        projected[first, :, :rows] += moved[e[first]]
+        out[:, :rows] += (means.transpose(0, 2, 1) @ self.duals.inverse)[e] @ projected
+        out[:, :rows, :rows] += self._stretched_again(q, pair, weight * force, k)
+        return out
+
+    def stretched_means(self, q: Bools, pressure: Array) -> tuple[Array, Array, Array, Array]:
+        """How gaps weighted with multipliers change with the parts of the plane that points ``q`` stand for, and their means.
+
+        Returns:
+            At the points, derivatives by the gap, and by the part ``(q,)``; of the facets, derivatives by the mean gaps, and of these
+            over the functions' products, by the nodes that stretch parts ``(m, nc, nc gdim)``.
+        """
+        e, b, (m, nc) = self.facet[self.segments.pair[q]], self.b[q], self.nodes.shape
+        of_gap, of_mean = (values[..., 0] for values in self.duals.spread(e, b, pressure[:, :, None]))
+        mean, gap = self.duals.gap[e], self.segments.gap[q] - self.offset[q]
+        left = gap - np.einsum("qb,qb->q", b, mean)
+        weighted = self.segments.weight[q, None] * self.stretching[q].reshape(len(e), nc * self.x.shape[2])
+        means, moved = (
+            add_up(e, products(values, weighted), m).reshape(m, nc, weighted.shape[1]) for values in (of_mean, left[:, None] * b)
+        )
+        return of_gap, of_gap * gap + np.einsum("qb,qb->q", of_mean, mean), means, moved
+
+    def _stretched_again(self, q: Bools, pair: Ints, force: Array, k: int) -> Array:
+        """Half of the second derivatives of the parts that points ``q`` stand for, times forces, ``(k, nc gdim, nc gdim)``."""
+        e, g = self.facet[self.segments.pair[q]], self.x.shape[2]
+        tab, x, n, size = self.shape.tabulate(self.segments.xi[q]), self.x[e], self.planes.normal[e], self.planes.size[e]
+        tangent, vector = tangents(tab, x), area_vectors(tab, x)
+        over, turning = np.einsum("qg,qg->q", vector, n), self.turning[e] / size[:, None, None, None]
+        if g == 2:
+            own = tab.dN[:, :, 0, None, None] * np.array([[0.0, 1.0], [-1.0, 0.0]])
+        else:
+            own = tab.dN[:, :, 1, None, None] * skew(tangent[:, None, 0]) - tab.dN[:, :, 0, None, None] * skew(
+                tangent[:, None, 1]
+            )
+        own = own / over[:, None, None, None] - turning
+        grown, out = self.stretching_at(e, tab), np.zeros((k, x.shape[1] * g, x.shape[1] * g))
+        if self.radius is not None:
+            radial = np.zeros(grown.shape)
+            radial[:, :, 0] = self.phi[q] / self.radius[q, None]
+            out += sum_of_products(pair, force, grown, radial, k)
+        for c in range(g):
+            out += sum_of_products(pair, force, turning[:, :, c], own[:, :, c], k)
+        out -= sum_of_products(pair, 2 * force, (n[:, None, None] @ turning)[:, :, 0], grown, k)
+        if g == 2:
+            return out
+        for row, unit in zip(np.moveaxis(skew(n / over[:, None]), 1, 0), np.eye(g)):
+            out -= sum_of_products(pair, force, tab.dN[:, :, 0, None] * unit, tab.dN[:, :, 1, None] * row[:, None], k)
+        ring = ring_of(self.shape)
+        lean = add_up(pair, (force * self.sign[e] / size)[:, None] * (vector / over[:, None] - 2 * n), k)
+        corners = out.reshape(k, x.shape[1], g, x.shape[1], g)
+        corners[:, : len(ring), :, : len(ring)] -= 0.25 * ring[None, :, None, :, None] * skew(lean)[:, None, :, None, :]
         return out
 
     def _loaded(self, pressing: Ints, amount: Array) -> tuple[Ints, Array, Array, Array, Array, Array, Motions]:
