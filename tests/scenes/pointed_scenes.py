@@ -129,8 +129,12 @@ def punch(w=0.47, n=8, push=0.02, closed=True, **how):
     return pressed([low, high], ([(0, at(1, 0.0))], [(1, face)]), led, (1.0, 10.0), **how), [-w, w]
 
 
-def ironing(n, friction=0.0, press=0.1, drag=0.5, steps=6, **how):
-    """A stiff die with slanting sides, pressed into a slab whose nodes are the contactors and dragged: drag over force in every step."""
+def ironed(n, friction=0.0, press=0.1, drag=0.5, steps=6, **how):
+    """A stiff die with slanting sides, pressed into a slab whose nodes are the contactors and dragged.
+
+    Returns:
+        Ways of the die and forces on the slab ``(steps + 1,)``, ``(steps + 1, 2)``, and stored energies ``(steps + 1,)``.
+    """
     w, x0 = 0.5, 1.013
 
     def slant(x):
@@ -142,11 +146,28 @@ def ironing(n, friction=0.0, press=0.1, drag=0.5, steps=6, **how):
     def face(x):
         return (np.abs(x[:, 1]) < 1e-9) | (np.abs(np.abs(x[:, 0] - x0) - w * (1 + 2.7 * x[:, 1])) < 1e-9)
 
-    led = (1, at(1, 0.5), [0.0, -press])
+    led, energy = (1, at(1, 0.5), [0.0, -press]), []
+
+    def law(u, E):
+        energy.append(uem.NeoHooke(E, 0.3, kind="plane_strain").energy(u) * ufl.dx)
+        return neo_hooke(u, E)
+
     problem, contact, prescribed = pressed(
-        [slab, die], ([(0, at(1, 0.0))], [(1, face)]), led, (1.0, 10.0), law=neo_hooke, friction=friction, **how
+        [slab, die], ([(0, at(1, 0.0))], [(1, face)]), led, (1.0, 10.0), law=law, friction=friction, **how
     )
     run(problem)
+
+    def state():
+        return contact.resultant().force, uem.integrate(energy[0])
+
+    found = [state()]
     prescribed.value[:] = (drag, -press)
-    forces = np.array([contact.resultant().force for _ in uem.load_steps(problem, steps)])
+    found += [state() for _ in uem.load_steps(problem, steps)]
+    forces, energies = (np.array(values) for values in zip(*found))
+    return np.linspace(0.0, drag, steps + 1), forces, energies
+
+
+def ironing(*args, **how):
+    """Drag over force in every step of ``ironed``."""
+    forces = ironed(*args, **how)[1][1:]
     return forces[:, 0] / forces[:, 1]
