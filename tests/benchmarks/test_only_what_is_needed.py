@@ -285,7 +285,8 @@ def test_surface_that_no_corner_comes_near(comm, monkeypatch):
         b = blocks(comm, "quadrilateral", overhang=overhang)
         problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
         run(problem)
-    assert [tag.name for _, _, tag, *_ in made] == ["low", "low"]
+    # the outside of confined bodies is oriented for another warning
+    assert [tag.name for _, _, tag, *_ in made if tag.name in ("low", "high")] == ["low", "low"]
 
 
 # -- imports ---------------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import facets_of, unit
 from uem_dolfinx.geometry.projection import FacetProjection
+from uem_dolfinx.geometry.search import ON_SIDE
 from uem_dolfinx.geometry.sharp import SHARP_EDGE
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import reduced
@@ -30,7 +31,7 @@ def overhanging(config: Configuration, nodes: Indices, contactor: Tag, p: FacetP
         which: contactors that are looked at ``(n,)``.
     """
     g, none = config.gdim, np.zeros(len(nodes), dtype=bool)
-    near = which & (p.way_beyond > 0.0) & (p.way_beyond <= END_HOLDS * p.facet_size)
+    near = which & (p.way_beyond > ON_SIDE * p.facet_size) & (p.way_beyond <= END_HOLDS * p.facet_size)
     if not reduced(config.comm, bool(near.any()), op=MPI.LOR):
         return none
     try:
