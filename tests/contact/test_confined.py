@@ -34,9 +34,9 @@ def pressed(ratio, cell="triangle", n=(3, 4), law=with_pressure, coupling="node_
 @pytest.mark.parametrize(
     ("ratio", "how", "least", "warned"),
     [
-        # 0.53 % of the volume is room
+        # 0.53 % of the volume is room, 9 % between two cells and three
         (1e3, {}, 0.98, True),
-        slow(1e3, {"law": neo_hooke_with_pressure}, 0.98, True), slow(1e3, {"gap": 0.02}, 0.98, True),
+        slow(3e2, {"law": neo_hooke_with_pressure, "n": (2, 3)}, 0.8, True), slow(1e3, {"gap": 0.02}, 0.98, True),
         slow(1e3, {"cell": "quadrilateral"}, 0.0, True), slow(1e5, {}, 0.0, True),
         # 0.06 %: other contactors bear the load
         slow(3e3, {}, 0.999, False), slow(1e2, {}, 0.999, False), slow(1.5, {}, 0.999, False),

@@ -133,3 +133,12 @@ def test_a_plug_as_long_as_its_tube(cell, layers, past):
     if cell == "hexahedron":
         # ends carry the force of what is past them
         assert np.ptp(p) < (1e-9 if abs(past) < 1e-9 or layers == 1 else max(0.01, 4 * past)) * p.mean()
+
+
+@pytest.mark.slow
+def test_pressures_at_vertices_without_area():
+    """Vertices of quadratic triangles in concave corners of the hole have the pressures around, and not a force over rounding."""
+    problem, contact = plug("tetrahedron", 12, degree=2, springs=1e-4)
+    problem.solve()
+    p = pressures(contact)
+    assert p.min() > 0.7 * lame() and p.max() < 1.3 * lame()

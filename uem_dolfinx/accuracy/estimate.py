@@ -18,7 +18,7 @@ from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: With fewer facets in contact along each direction of the surface, estimates see less than half of the error.
-#: [convention; facets; test_adapt.py::test_a_large_tolerance]
+#: [convention; facets; test_adapt.py::test_few_facets_in_contact]
 FEWEST = 2
 #: Where fewer are, the error is at most so many times the estimate.
 #: [convention; estimate; test_adapt.py::test_few_facets_in_contact]

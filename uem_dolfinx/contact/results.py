@@ -28,6 +28,11 @@ if TYPE_CHECKING:
     from uem_dolfinx.contact.mortar.seam import Seam
 
 
+#: Smaller areas, over those of nodes around, are zero to rounding.
+#: [bound; area; test_conforming_rings.py::test_pressures_at_vertices_without_area]
+NO_AREA = 1e-10
+
+
 @dataclass(frozen=True)
 class Resultant:
     """Force ``(gdim,)`` and moment about a point, ``(1,)`` in 2D and ``(3,)`` in 3D; for axisymmetric bodies the axial force.
@@ -151,7 +156,18 @@ class ContactResults(HeatResults):
         current = self.measure == "current"
         facing = self.areas_facing(self.nodes, self.pair.kinematics.projection.normal, current)
         found, tie = self.pair.kinematics.pressure_map(current).areas(facing), self.pair.tie
+        # quadratic functions of a triangle's vertices have no integral
+        found = np.where(found > NO_AREA * self.pair.discretisation.spread(facing), found, 0.0)
         return self._seam.evenly(self.nodes, found if tie is None else tie.areas(facing, self._areas, found))
+
+    def _per_area(self, forces: Array) -> Array:
+        """Forces over areas ``(n_contactors,)``; without an area of its own, a contactor has those of nodes around (collective)."""
+        areas, spread = self.measured_areas(), self.pair.discretisation.spread
+        normal = self.pair.kinematics.projection.normal
+        whole = spread(self.areas_facing(self.nodes, normal, self.measure == "current"))
+        none = (areas <= 0) & (whole > 0)
+        areas, forces = np.where(none, whole, areas), np.where(none, spread(forces), forces)
+        return np.asarray(np.where(areas > 0, forces / np.where(areas > 0, areas, 1.0), 0.0))
 
     @cached_property
     def _seam(self) -> Seam:
@@ -210,8 +226,7 @@ class ContactResults(HeatResults):
         or the current surface.
         Pressure is negative where tied surfaces are in tension.
         """
-        areas = self.measured_areas()
-        return np.where(areas > 0, self.pressing()[0] / np.where(areas > 0, areas, 1.0), 0.0)
+        return self._per_area(self.pressing()[0])
 
     def max_pressure(self) -> float:
         """Largest contact pressure, a force per area (collective)."""
@@ -267,8 +282,7 @@ class ContactResults(HeatResults):
     @property
     def traction(self) -> fem.Function:
         """Tangential force of friction or of a tie, per area as for ``pressure``, as a vector field (collective)."""
-        tau, areas = self.pressing()[1], self.measured_areas()[:, None]
-        return self._field("traction", np.where(areas > 0, tau / np.where(areas > 0, areas, 1.0), 0.0), vector=True)
+        return self._field("traction", np.column_stack([self._per_area(along) for along in self.pressing()[1].T]), vector=True)
 
     @property
     def slip(self) -> fem.Function:

@@ -84,6 +84,8 @@ class _Reader:
             if self.model.steps and not self._perturbs:
                 self.model.left_out.append("*FREQUENCY without PERTURBATION: about the state of the last step")
             self.model.modes, keyword, rows = int(rows[0][0]), "STATIC", []
+        elif keyword in STEP_KINDS and self._perturbs:
+            self.model.left_out.append("PERTURBATION of *STEP")
         if keyword in STEP_KINDS:
             times = [*_numbers(rows[0] if rows else []), 0.0, 0.0]
             duration = times[1] or 1.0

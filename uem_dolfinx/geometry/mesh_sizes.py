@@ -32,7 +32,7 @@ OTHERS = {
 SUBDIVIDED = 2.5
 
 #: Copies of simplices at the boundary are so many times as large, so that they reach to arcs of 90 degrees along a side.
-#: [convention; size of a cell; test_mesh_sizes.py::test_arcs_outside_coarse_cells]
+#: [bound; size of a cell; test_mesh_sizes.py::test_arcs_outside_coarse_cells]
 ENLARGED = 2.0
 
 
