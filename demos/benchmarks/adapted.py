@@ -47,7 +47,7 @@ MESHES: dict[str, tuple[str, dict[str, float], int, float | None]] = {
     "degree 2, adapted, 0.35 %": ("adapt_hertz", {}, 2, 0.0035),
 }
 #: Tolerances of adaptations by degree, for a table of what they reach.
-TOLERANCES = {1: (0.2, 0.1, 0.05, 0.02), 2: (0.2, 0.1, 0.05, 0.02, 0.01, 0.005)}
+TOLERANCES = {1: (0.2, 0.1, 0.05, 0.02), 2: (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.003)}
 REFERENCE = ("adapt_hertz", {}, 2, 0.001)
 
 

@@ -31,11 +31,17 @@ def force_of(made, steps=2):
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("w", [0.47, 0.495])
 def test_forces_of_a_punch(n, closed, w):
-    """On meshes whose nodes straddle the corners the force is nearer to that of fine ones: within 9 % where 9 to 23 % were lacking."""
+    """On meshes whose nodes straddle the corners the force is nearer to that of fine ones: within 9 % where 9 to 24 % were lacking.
+
+    Nodes next to a corner are held there without it where the target ends at the corner.
+    """
     without, with_corners = (force_of(punch(w=w, n=n, closed=closed, corners=corners))[0] for corners in (False, True))
     reference = OF_PUNCH * (1.0 if w == 0.47 else 1.03)
-    assert without < 0.93 * reference < with_corners < 1.1 * reference
-    assert abs(with_corners - reference) < 0.6 * abs(without - reference)
+    assert 0.93 * reference < with_corners < 1.1 * reference
+    if w == 0.495 and not closed:
+        assert without == pytest.approx(with_corners, rel=1e-3)
+    else:
+        assert without < 0.93 * reference and abs(with_corners - reference) < 0.6 * abs(without - reference)
 
 
 @pytest.mark.parametrize(

@@ -189,14 +189,13 @@ def test_edges_that_coincide_do_not_slip_off(width, degree):
 
 
 @pytest.mark.slow
-def test_what_has_sunk_beside_the_end_does_not_come_back_with_a_blow(caplog):
-    """The block juts out by a 1e-4 of a facet, its corners sink past the rod's, and the rod swells under them: they are left out."""
-    landing = Landing(1.5, 1.5, width=(2, 3), nu=0.3, cells=8, wider=2e-6)
-    with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
-        path = landing.run(2.2)
-    assert COMM.rank != 0 or "2 contactors that had slid past the end of the target and sunk" in caplog.text
-    # each blow would be of 6e-3
-    assert np.diff(path.energy, prepend=1.0).clip(0.0).sum() < 2e-3 and path.cuts <= 2
+@pytest.mark.parametrize("wider", [2e-6, 3.4e-3, 6e-3])
+def test_corners_beside_the_end_are_no_blow(wider):
+    """The block juts out by 1e-4, a tenth or a fifth of a facet, and both bodies swell: its corners are held, or left out."""
+    landing = Landing(1.5, 1.5, width=(2, 3), nu=0.3, cells=8, wider=wider)
+    path = landing.run(2.2)
+    # a blow would be of 6e-3
+    assert np.diff(path.energy, prepend=1.0).clip(0.0).sum() < 1e-5 and path.cuts == 0
     assert landing.contacts[0].n_active == 0 and COMM.allreduce(int(landing.problem.pairs[0].trial.barred.sum())) == 0
 
 

@@ -131,7 +131,6 @@ REFUSED = {
     "sliding='small'": ({"sliding": "small"}, "E", "projected where an earlier step ended"),
     "the shape, sliding='fixed'": ({"sliding": "fixed"}, "X", "needs contacts of sliding='finite'"),
     "friction, the shape and a function of place": ({"friction": lambda x: 0.3 + 0.1 * x[0]}, "X", "a function of place"),
-    "friction, mortar": ({"friction": 0.3, "coupling": "mortar"}, "E", "coupling='node_to_surface'"),
     "friction, sliding='small'": ({"friction": 0.3, "sliding": "small"}, "E", "sliding='finite'"),
     "friction, averaged normals": ({"friction": 0.3, "normals": "averaged"}, "E", "normals='facet'"),
     "Tresca": ({"friction": uem.Tresca(0.01)}, "E", "Coulomb's law"),

@@ -34,7 +34,7 @@ class PartSolver(UnitedSolver):
         self.lasting = True
         self._pc: PETSc.PC | None = None
         self._at: Ints = np.zeros(0, np.int64)
-        #: Columns of P in use, and fingerprint of the matrix without coefficients of P, None unless it was set ``roughly``.
+        #: Columns of P in use, and fingerprint of the matrix without coefficients of P.
         self._used: Bools = np.zeros(0, bool)
         self._alike: tuple[Any, ...] | None = None
 
@@ -49,8 +49,8 @@ class PartSolver(UnitedSolver):
         made = made_of(P, Q, K, G, False)
         if made is not None and made == self._made_of:
             return
-        alike = made_of(P, Q, K, G, True) if roughly else None
-        if alike is not None and made is not None and alike == self._alike:
+        alike = made_of(P, Q, K, G, True)
+        if roughly and made is not None and alike == self._alike:
             return
         self._made_of, self._alike, self._used = made, alike, P.used.ravel()
         with timed("united matrix of explicit steps"):
