@@ -18,6 +18,11 @@ from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import reduced
 
 
+def close_to_ends(p: FacetProjection, which: Bools) -> Bools:
+    """Contactors of ``which (n,)`` that are past an end by at most ``END_HOLDS`` of the target's facet ``(n,)``."""
+    return np.asarray(which & (p.way_beyond > ON_SIDE * p.facet_size) & (p.way_beyond <= END_HOLDS * p.facet_size))
+
+
 def overhanging(config: Configuration, nodes: Indices, contactor: Tag, p: FacetProjection, which: Bools) -> Bools:
     """Contactors past an end by at most ``END_HOLDS`` of one of their own facets, which faces the target and is over it ``(n,)``.
 
@@ -30,15 +35,14 @@ def overhanging(config: Configuration, nodes: Indices, contactor: Tag, p: FacetP
         p: projection of the contactors.
         which: contactors that are looked at ``(n,)``.
     """
-    g, none = config.gdim, np.zeros(len(nodes), dtype=bool)
-    near = which & (p.way_beyond > ON_SIDE * p.facet_size) & (p.way_beyond <= END_HOLDS * p.facet_size)
+    g, near = config.gdim, close_to_ends(p, which)
     if not reduced(config.comm, bool(near.any()), op=MPI.LOR):
-        return none
+        return near
     try:
         own = facets_of(config, contactor, "contactor")
     except OrientationError:
         # a surface inside a body faces nothing
-        return none
+        return np.zeros(len(nodes), dtype=bool)
     at_nodes = np.zeros((config.n_owned, 2 * g))
     at_nodes[nodes[near]] = np.column_stack([unit(p.beyond), p.normal])[near]
     x, of_facets = own.x, own.nodes.ravel()

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
@@ -19,6 +21,7 @@ from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
 from uem_dolfinx.geometry.joined_rigid import JoinedRigid
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
+from uem_dolfinx.parallel import reduced
 
 
 class JoinedNodes(NodeToSurface):
@@ -65,6 +68,11 @@ class JoinedNodes(NodeToSurface):
         """See ``NodeToSurface``: by the facets of each contact."""
         if not isinstance(projection, FacetProjection):
             return super().overhanging(projection, which)
+        from uem_dolfinx.contact.nodes.overhang import close_to_ends
+
+        near = close_to_ends(projection, which)
+        if not reduced(self.config.comm, bool(near.any()), op=MPI.LOR):
+            return near
         every = np.arange(len(self.nodes))
         parts = [one.overhanging(projection.take(every[own]), which[own]) for one, own in zip(self._own, self.rows_of)]
         return np.concatenate(parts)
