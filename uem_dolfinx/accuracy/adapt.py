@@ -283,12 +283,5 @@ def _measured(problem: UnitedProblem, estimate: ErrorEstimate | GoalError, steps
         iterations += sum(getattr(step, "newton_iterations", 0) for step in steps)
     unknowns = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
     parts = estimate.parts / abs(estimate.value) if isinstance(estimate, GoalError) else estimate.relative
-    return AdaptedMesh(
-        int(cells),
-        int(unknowns),
-        estimate.relative,
-        parts,
-        iterations,
-        perf_counter() - start,
-        bool(narrow_contacts(problem, FEWEST)),
-    )
+    narrow = narrow_contacts(problem, FEWEST) if isinstance(estimate, GoalError) else estimate.narrow
+    return AdaptedMesh(int(cells), int(unknowns), estimate.relative, parts, iterations, perf_counter() - start, bool(narrow))

@@ -153,18 +153,23 @@ class ContactResults(HeatResults):
 
     def measured_areas(self) -> Array:
         """Areas for pressures and tractions at contactors ``(n_contactors,)``, zero where there is no area (collective)."""
-        current = self.measure == "current"
-        facing = self.areas_facing(self.nodes, self.pair.kinematics.projection.normal, current)
-        found, tie = self.pair.kinematics.pressure_map(current).areas(facing), self.pair.tie
+        return self._measured(self._facing())
+
+    def _facing(self) -> Array:
+        """Integrals of the shape functions at the contactors, see ``areas_facing`` (collective)."""
+        return self.areas_facing(self.nodes, self.pair.kinematics.projection.normal, self.measure == "current")
+
+    def _measured(self, facing: Array) -> Array:
+        """The measured areas, from integrals of the shape functions ``(n_contactors,)`` (collective)."""
+        found, tie = self.pair.kinematics.pressure_map(self.measure == "current").areas(facing), self.pair.tie
         # quadratic functions of a triangle's vertices have no integral
         found = np.where(found > NO_AREA * self.pair.discretisation.spread(facing), found, 0.0)
         return self._seam.evenly(self.nodes, found if tie is None else tie.areas(facing, self._areas, found))
 
     def _per_area(self, forces: Array) -> Array:
         """Forces over areas ``(n_contactors,)``; without an area of its own, a contactor has those of nodes around (collective)."""
-        areas, spread = self.measured_areas(), self.pair.discretisation.spread
-        normal = self.pair.kinematics.projection.normal
-        whole = spread(self.areas_facing(self.nodes, normal, self.measure == "current"))
+        facing, spread = self._facing(), self.pair.discretisation.spread
+        areas, whole = self._measured(facing), spread(facing)
         none = (areas <= 0) & (whole > 0)
         areas, forces = np.where(none, whole, areas), np.where(none, spread(forces), forces)
         return np.asarray(np.where(areas > 0, forces / np.where(areas > 0, areas, 1.0), 0.0))
