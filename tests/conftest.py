@@ -35,7 +35,7 @@ from helpers import complementary, coulomb, highest
 import uem_dolfinx as uem
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES
-from uem_dolfinx.solve.bodies.norms import first
+from uem_dolfinx.solve.bodies.field_scales import first
 from uem_dolfinx.solve.united.system import BodySystem
 
 if "PYTEST_XDIST_WORKER" not in os.environ:

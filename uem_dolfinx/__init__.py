@@ -72,8 +72,7 @@ from uem_dolfinx.algebra.options import multigrid_options, saddle_options
 from uem_dolfinx.compat import function_space
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
-from uem_dolfinx.contact.laws.coulomb import Coulomb
-from uem_dolfinx.contact.laws.tresca import Tresca
+from uem_dolfinx.contact.laws.coulomb import Coulomb, Tresca
 from uem_dolfinx.contact.results import Balance, Resultant
 from uem_dolfinx.errors import (
     CheckpointError,
@@ -117,32 +116,23 @@ from uem_dolfinx.solve.steps.load_steps import load_steps
 
 if _TYPE_CHECKING:
     from uem_dolfinx.accuracy.adapt import Adaptation, adapt
-    from uem_dolfinx.accuracy.estimate import ErrorEstimate, error_estimate
+    from uem_dolfinx.accuracy.estimate import ErrorEstimate, ErrorLimit, error_estimate
     from uem_dolfinx.accuracy.goal import GoalError, goal_error
-    from uem_dolfinx.accuracy.limit import ErrorLimit
     from uem_dolfinx.conditions.at_points import PointLoad, PointSpring
-    from uem_dolfinx.conditions.equation import Equation, periodic
+    from uem_dolfinx.conditions.equation import Equation, MeanMotion, periodic
     from uem_dolfinx.conditions.joints import Ball, Hinge, Slider, Spring
-    from uem_dolfinx.conditions.mean_motion import MeanMotion
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
-    from uem_dolfinx.contact.laws.adhesion import Adhesion
-    from uem_dolfinx.contact.laws.cohesive import Cohesive
+    from uem_dolfinx.contact.laws.cohesive import BenzeggaghKenane, Cohesive, Power
     from uem_dolfinx.contact.laws.conductance import Conductance
-    from uem_dolfinx.contact.laws.exponential import Exponential
+    from uem_dolfinx.contact.laws.law import OfTemperature
     from uem_dolfinx.contact.laws.leak import Leak
-    from uem_dolfinx.contact.laws.mixed_mode import BenzeggaghKenane, Power
-    from uem_dolfinx.contact.laws.power_law import PowerLaw
-    from uem_dolfinx.contact.laws.soft import SoftContact
-    from uem_dolfinx.contact.laws.stribeck import Stribeck
-    from uem_dolfinx.contact.laws.thermal import OfTemperature
-    from uem_dolfinx.contact.laws.thirion import Thirion
-    from uem_dolfinx.contact.laws.viscous import ViscousFriction
+    from uem_dolfinx.contact.laws.soft import Adhesion, Exponential, PowerLaw, SoftContact
+    from uem_dolfinx.contact.laws.stribeck import Stribeck, Thirion, ViscousFriction
     from uem_dolfinx.contact.preload import Preload
     from uem_dolfinx.decks.deck import Deck, read_deck
-    from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
     from uem_dolfinx.dynamics.inertia import Dynamics
     from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
-    from uem_dolfinx.dynamics.scheme import Scheme, generalised_alpha, newmark
+    from uem_dolfinx.dynamics.scheme import CentralDifferences, Scheme, generalised_alpha, newmark
     from uem_dolfinx.geometry.gmsh import example_mesh, read_gmsh
     from uem_dolfinx.geometry.mesh_files import read_mesh
     from uem_dolfinx.gradients.gradient import gradient, tangent, taylor_test
@@ -165,20 +155,20 @@ if _TYPE_CHECKING:
     from uem_dolfinx.scripting import assemble_matrix, assemble_vector, dirichlet, ds, dx, form, integrate, interpolate
     from uem_dolfinx.solve.modes import Vibrations, modes
     from uem_dolfinx.solve.settings import Newton
-    from uem_dolfinx.solve.steps.step import Step
+    from uem_dolfinx.solve.steps.stages import Step
     from uem_dolfinx.solve.steps.time_step import TimeStep
     from uem_dolfinx.solve.steps.time_steps import time_steps
 
 #: Modules that are imported on first use of one of their names.
 _LATER = {
     "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "SoftContact": "contact.laws.soft",
-    "Thirion": "contact.laws.thirion",
-    "Exponential": "contact.laws.exponential", "PowerLaw": "contact.laws.power_law",
-    "Adhesion": "contact.laws.adhesion",
+    "Thirion": "contact.laws.stribeck",
+    "Exponential": "contact.laws.soft", "PowerLaw": "contact.laws.soft",
+    "Adhesion": "contact.laws.soft",
     "Leak": "contact.laws.leak",
-    "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.mixed_mode", "Power": "contact.laws.mixed_mode",
-    "OfTemperature": "contact.laws.thermal", "read_mesh": "geometry.mesh_files", "read_deck": "decks.deck", "Deck": "decks.deck",
-    "CentralDifferences": "dynamics.explicit.central_differences",
+    "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.cohesive", "Power": "contact.laws.cohesive",
+    "OfTemperature": "contact.laws.law", "read_mesh": "geometry.mesh_files", "read_deck": "decks.deck", "Deck": "decks.deck",
+    "CentralDifferences": "dynamics.scheme",
     "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",
     "lumped_mass": "dynamics.mass", "nodal_mass": "dynamics.mass",
     "Scheme": "dynamics.scheme", "generalised_alpha": "dynamics.scheme", "newmark": "dynamics.scheme",
@@ -188,8 +178,8 @@ _LATER = {
     "example_mesh": "geometry.gmsh", "read_gmsh": "geometry.gmsh",
     "assemble_matrix": "scripting", "assemble_vector": "scripting", "form": "scripting",
     "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
-    "ViscousFriction": "contact.laws.viscous", "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
-    "Equation": "conditions.equation", "periodic": "conditions.equation", "MeanMotion": "conditions.mean_motion",
+    "ViscousFriction": "contact.laws.stribeck", "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
+    "Equation": "conditions.equation", "periodic": "conditions.equation", "MeanMotion": "conditions.equation",
     "RigidCoupling": "conditions.rigid_coupling", "Ball": "conditions.joints", "Hinge": "conditions.joints",
     "Slider": "conditions.joints", "Spring": "conditions.joints",
     "Preload": "contact.preload",
@@ -200,13 +190,13 @@ _LATER = {
     "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
     "plot_setup": "output.pictures",
     "Adaptation": "accuracy.adapt", "adapt": "accuracy.adapt",
-    "ErrorEstimate": "accuracy.estimate", "error_estimate": "accuracy.estimate", "ErrorLimit": "accuracy.limit",
+    "ErrorEstimate": "accuracy.estimate", "error_estimate": "accuracy.estimate", "ErrorLimit": "accuracy.estimate",
     "GoalError": "accuracy.goal", "goal_error": "accuracy.goal",
     "ContactParameter": "gradients.parameters",
     "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
     "History": "gradients.history", "recording": "gradients.recording",
     "Newton": "solve.settings",
-    "Step": "solve.steps.step", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
+    "Step": "solve.steps.stages", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
 }  # fmt: skip
 
 

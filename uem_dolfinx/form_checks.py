@@ -106,12 +106,7 @@ def _holds_once(form: ufl.Form, arguments: Any) -> bool:
 
 
 def _check_mesh(what: str, form: Any, domain: Any = None) -> None:
-    """Refuse a form with integrals, Functions, coordinates or tags of another mesh; None takes the mesh of its first integral.
-
-    Raises:
-        SpaceError: names the object of another mesh.
-        InputError: for an integral over a numbered part without tags.
-    """
+    """SpaceError for a form on another mesh than that of its first integral, InputError for integrals over parts without tags."""
     own = None if domain is None else domain.ufl_domain()
     tagged = {integral.integral_type() for integral in form.integrals() if integral.subdomain_data() is not None}
     for integral in form.integrals():

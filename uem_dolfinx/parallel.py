@@ -180,7 +180,6 @@ class Exchange:
     message of bytes for each pair of ranks. On one rank nothing is sent, and rows in order are not copied.
 
     Args:
-        comm: communicator.
         rows: for each rank the indices of this rank's rows that are sent to it; a row may go to several ranks, or to no rank.
 
     Attributes:

@@ -17,7 +17,7 @@ from helpers import blocks, highest, modulus, refused, slow, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
-from uem_dolfinx.accuracy.first_guess import carry_over
+from uem_dolfinx.accuracy.adapt import carry_over
 
 COMM = MPI.COMM_WORLD
 

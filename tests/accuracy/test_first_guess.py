@@ -16,7 +16,7 @@ from seal_scenes import Seal
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.accuracy.first_guess import carry_over
+from uem_dolfinx.accuracy.adapt import carry_over
 from uem_dolfinx.errors import ConvergenceError
 
 COMM = MPI.COMM_WORLD

@@ -12,7 +12,7 @@ from helpers import slow
 
 import uem_dolfinx as uem
 from uem_dolfinx import forms
-from uem_dolfinx.accuracy.tractions import contact_tractions
+from uem_dolfinx.accuracy.enriched import contact_tractions
 
 COMM = MPI.COMM_WORLD
 

@@ -10,7 +10,7 @@ from helpers import blocks
 
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.algebra.kept_preconditioner import KeptPreconditioner
+from uem_dolfinx.algebra.ksp import KeptPreconditioner
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import multigrid_options
 from uem_dolfinx.geometry.configuration import Configuration

@@ -11,8 +11,8 @@ from helpers import blocks
 
 from uem_dolfinx import forms
 from uem_dolfinx.algebra import options
+from uem_dolfinx.algebra.blocks import is_symmetric
 from uem_dolfinx.algebra.deflation import near_null_space
-from uem_dolfinx.algebra.entries import is_symmetric
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import has_hypre, has_mumps
 from uem_dolfinx.geometry.configuration import Configuration

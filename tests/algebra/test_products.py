@@ -12,7 +12,7 @@ from helpers import gathered_matrix
 from petsc4py import PETSc
 
 from uem_dolfinx import compat
-from uem_dolfinx.algebra.entries import Entries
+from uem_dolfinx.algebra.blocks import Entries
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 

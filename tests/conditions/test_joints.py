@@ -15,7 +15,7 @@ from rigid_boxes import RigidBoxes, quadratic
 
 import uem_dolfinx as uem
 from uem_dolfinx.conditions.joints import across
-from uem_dolfinx.conditions.pair_motion import RA, RB, TA, TB, Body, angle, distance, projected
+from uem_dolfinx.conditions.relations import RA, RB, TA, TB, Body, angle, distance, projected
 from uem_dolfinx.geometry.rigid import rotation_matrix
 
 COMM = MPI.COMM_WORLD

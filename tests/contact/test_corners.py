@@ -9,7 +9,7 @@ from helpers import at, blocks, box, clamp, highest, linear, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.nodes.corners import find_corners
+from uem_dolfinx.contact.nodes.concave_edges import find_corners
 from uem_dolfinx.contact.seam.corners import Corners
 
 COMM = MPI.COMM_WORLD

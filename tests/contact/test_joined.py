@@ -21,7 +21,7 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.contact import joining
 from uem_dolfinx.contact.laws.law import as_law
-from uem_dolfinx.contact.pair.member import Member
+from uem_dolfinx.contact.pair.joined_nodes import Member
 
 CALLS = ("Allreduce", "allreduce", "Allgather", "allgather", "Alltoall", "Alltoallv", "bcast")
 

@@ -101,7 +101,7 @@ def test_a_block_wider_than_its_support(cell, past, how, caplog):
 def test_how_far_facets_reach(past, factor, held, monkeypatch, caplog):
     """An end holds a contactor past it by a tenth of the facet; farther ones have no contact, with a warning at the smallest push."""
     monkeypatch.setattr(ends, "END_HOLDS", factor * ends.END_HOLDS)
-    monkeypatch.setattr("uem_dolfinx.contact.nodes.overhang.END_HOLDS", ends.END_HOLDS)
+    monkeypatch.setattr("uem_dolfinx.contact.nodes.node_to_surface.END_HOLDS", ends.END_HOLDS)
     problem, (contact,) = on_support(past=past, push=1e-6)
     list(uem.load_steps(problem, 1))
     assert contact.n_active == (2 if held else 0) and warned(caplog) == (not held)

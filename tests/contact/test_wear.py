@@ -18,7 +18,7 @@ from restart_scenes import bits
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.contact.laws.archard import worn_volume
+from uem_dolfinx.contact.friction.wear import worn_volume
 
 COMM = MPI.COMM_WORLD
 K, P, WAY = 1e-2, 0.02, 0.5

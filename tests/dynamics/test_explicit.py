@@ -19,10 +19,8 @@ from helpers import at, box, clamp, scene
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
-from uem_dolfinx.dynamics.explicit.part_solver import PartSolver
+from uem_dolfinx.dynamics.explicit.part_solver import PartSolver, Prediction, SurfaceSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
-from uem_dolfinx.dynamics.explicit.surface import Prediction
-from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.united import system

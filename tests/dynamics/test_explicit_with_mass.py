@@ -16,9 +16,7 @@ from helpers import at, box, scene
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
-from uem_dolfinx.dynamics.explicit.mass_solver import MassSolver
-from uem_dolfinx.dynamics.explicit.part_solver import PartSolver
-from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver
+from uem_dolfinx.dynamics.explicit.part_solver import MassSolver, PartSolver, SurfaceSolver
 from uem_dolfinx.parallel import reduced
 
 COMM = MPI.COMM_WORLD

@@ -16,7 +16,7 @@ import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.geometry.cells import FLAT_CELL, flat_cells
 from uem_dolfinx.geometry.found import Block, Found
-from uem_dolfinx.geometry.serendipity import completed
+from uem_dolfinx.geometry.simplices import completed
 
 COMM = MPI.COMM_WORLD
 KINDS = [(kind, order) for kind in UNIT for order in (1, 2)]

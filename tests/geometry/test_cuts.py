@@ -13,9 +13,8 @@ from dolfinx import fem
 from helpers import refused
 
 import uem_dolfinx as uem
-from uem_dolfinx.geometry.cuts import cut
+from uem_dolfinx.geometry.cuts import Group, RawMesh, cut
 from uem_dolfinx.geometry.gmsh import distributed
-from uem_dolfinx.geometry.raw import Group, RawMesh
 
 COMM = MPI.COMM_WORLD
 KINDS = [("quadrilateral", 1), ("triangle", 1), ("triangle", 2), ("hexahedron", 1), ("tetrahedron", 2)]

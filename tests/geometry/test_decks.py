@@ -18,8 +18,7 @@ from helpers import refused
 
 import uem_dolfinx as uem
 from uem_dolfinx.geometry.found import KINDS, Block, Found
-from uem_dolfinx.geometry.serendipity import completed
-from uem_dolfinx.geometry.simplices import divided
+from uem_dolfinx.geometry.simplices import completed, divided
 from uem_dolfinx.parallel import reduced
 
 COMM = MPI.COMM_WORLD

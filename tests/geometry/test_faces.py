@@ -9,7 +9,7 @@ import pytest
 from body_scenes import ball, dimension, skin_of
 from helpers import CELLS, box
 
-from uem_dolfinx.geometry.faces import classes_of_facets, facets_by_class
+from uem_dolfinx.geometry.skin import classes_of_facets, facets_by_class
 
 COMM = MPI.COMM_WORLD
 

@@ -17,7 +17,7 @@ from helpers import NU, linear, refused, run
 import uem_dolfinx as uem
 from uem_dolfinx import compat
 from uem_dolfinx.geometry.found import Block, Found
-from uem_dolfinx.geometry.serendipity import completed
+from uem_dolfinx.geometry.simplices import completed
 
 COMM = MPI.COMM_WORLD
 KINDS = [(kind, order) for kind in UNIT for order in (1, 2)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import serial
 
-from uem_dolfinx.geometry.rank_boxes import RankBoxes
+from uem_dolfinx.geometry.candidates import RankBoxes
 
 pytestmark = serial
 

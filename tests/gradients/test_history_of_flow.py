@@ -18,9 +18,8 @@ from uem_dolfinx import compat
 from uem_dolfinx.materials.finite_plasticity import VARYING
 from uem_dolfinx.materials.hardening import Linear, Saturating
 from uem_dolfinx.materials.logarithmic import logarithmic_return, to_components, to_tensors
-from uem_dolfinx.materials.logarithmic_slopes import logarithmic_back
 from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
-from uem_dolfinx.materials.return_slopes import plane_stress_back, radial_back
+from uem_dolfinx.materials.return_slopes import logarithmic_back, plane_stress_back, radial_back
 
 SCENES = [
     {"kind": "plane_stress"},

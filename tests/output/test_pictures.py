@@ -22,7 +22,7 @@ from helpers import raised, refused
 from results_scenes import pressed
 
 import uem_dolfinx as uem
-from uem_dolfinx.output import drawings, films, pictures, pictures3d, sections
+from uem_dolfinx.output import drawings, films, pictures, pictures3d
 from uem_dolfinx.output import frames as frames_module
 
 mpl_image = pytest.importorskip("matplotlib.image")
@@ -111,9 +111,9 @@ def test_a_window_cuts_bodies(cell, drawn, folder):
 def test_rigid_surfaces(folder):
     """Are drawn where they have been moved to when the frame is taken, behind their surface, and each once."""
     ball = uem.RigidSphere((0.0, 0.0, 2.0), 1.0).move((0.0, 0.0, -0.5))
-    shapes = sections.rigid_shapes([types.SimpleNamespace(target=target) for target in (ball, "a tag", ball)])
+    shapes = frames_module.rigid_shapes([types.SimpleNamespace(target=target) for target in (ball, "a tag", ball)])
     ball.move((0.0, 0.0, 7.0))
-    axes, points = sections.grid(np.array([[-1.0, 1.0], [-2.0, 2.0], [0.0, 3.0]]), 20)
+    axes, points = frames_module.grid(np.array([[-1.0, 1.0], [-2.0, 2.0], [0.0, 3.0]]), 20)
     assert [len(x) for x in axes] == [12, 22, 17] and len(shapes) == 1
     np.testing.assert_allclose(points[:12, 0], axes[0])
     behind = np.linalg.norm(points - [0.0, 0.0, 1.5], axis=1) < 1.0

@@ -23,10 +23,9 @@ from petsc4py import PETSc
 from scipy.sparse import coo_matrix, diags
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.accuracy.enriched import Enriched
+from uem_dolfinx.accuracy.enriched import Enriched, narrow_contacts, warn_of_few_facets
 from uem_dolfinx.accuracy.enriched_rows import EnrichedRows, enriched_rows
 from uem_dolfinx.accuracy.estimate import refuse_estimate
-from uem_dolfinx.accuracy.few_facets import narrow_contacts, warn_of_few_facets
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.coulomb import Coulomb

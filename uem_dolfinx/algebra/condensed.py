@@ -23,10 +23,9 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.algebra import mumps
-from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix
-from uem_dolfinx.algebra.entries import SYMMETRIC, stiffen
+from uem_dolfinx.algebra.blocks import SYMMETRIC, Blocks, blocks_of_matrix, stiffen
+from uem_dolfinx.algebra.kept_factor import Returning
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.algebra.returning import Returning
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
@@ -129,15 +128,7 @@ class Condensed(Returning):
         return marked
 
     def _touched(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None, followed: Bools, holding: bool) -> Bools:
-        """Mask of nodes that C needs: nodes of equations, nodes in G, and nodes with changed Dirichlet conditions ``(n_owned,)``.
-
-        Args:
-            P: of a constrained matrix.
-            Q: of the same matrix.
-            G: the curvature.
-            followed: nodes that the equations follow ``(n_owned,)``.
-            holding: whether only active equations count.
-        """
+        """Mask of nodes that C needs: of equations, if ``holding`` of active ones, in G, and with changed conditions ``(n_owned,)``."""
         touched = followed.copy()
         for R in (P,) if P is Q else (P, Q):
             touched[R.united if holding else R.nodes] = True
@@ -349,12 +340,7 @@ class Condensed(Returning):
         return self._scattered(every @ self._St if self.space.comm.rank == 0 else None)
 
     def _on_root(self, blocks: Blocks, numbers: Ints) -> Any:
-        """A matrix of C as SciPy's, on rank 0; None elsewhere (collective).
-
-        Args:
-            blocks: of owned rows.
-            numbers: of all nodes of C, on rank 0.
-        """
+        """A matrix of C, from ``blocks`` of owned rows and the numbers of its nodes, as SciPy's on rank 0, else None (collective)."""
         from scipy.sparse import bsr_matrix
 
         parts = self.space.comm.gather(blocks)

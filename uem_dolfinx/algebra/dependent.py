@@ -12,6 +12,7 @@ Rows that depend on others become zero and are dropped: they are satisfied alrea
 
 from __future__ import annotations
 
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -19,11 +20,24 @@ from enum import IntEnum
 import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left, send
-from uem_dolfinx.algebra.nonnegative import least_squares
 from uem_dolfinx.algebra.rings import DEPENDENT, components
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import gathered, reduced
+
+
+def least_squares(E: Array, e: Array, quick: bool = True) -> Array:
+    """``x >= 0 (n,)`` that minimises ``|E x - e|``, ``E (m, n)``: ``quick`` is not accurate to rounding in every SciPy."""
+    from scipy.optimize import lsq_linear, nnls
+
+    most = 30 * E.shape[1]
+    if quick:
+        # nnls raises after too many iterations
+        with suppress(RuntimeError):
+            return np.asarray(nnls(E, e, maxiter=most)[0])
+    # its bounds hold to rounding
+    return np.maximum(lsq_linear(E, e, (0.0, np.inf), "bvls", 1e-15, max_iter=most).x, 0.0)
+
 
 #: A weight that exceeds one by more extrapolates: the contactor is past an end of the target.
 #: [bound; weight; test_dependent.py::test_rows_past_an_end_are_left_out_first]

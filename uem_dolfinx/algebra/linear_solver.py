@@ -9,9 +9,9 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms, given
 from uem_dolfinx.algebra import mumps
+from uem_dolfinx.algebra.blocks import is_symmetric, rows_are_symmetric, stiffen
 from uem_dolfinx.algebra.condensed import Condensed, Solved
 from uem_dolfinx.algebra.deflation import MULTIGRID, in_deflation, near_null_space, pressed_hard
-from uem_dolfinx.algebra.entries import is_symmetric, rows_are_symmetric, stiffen
 from uem_dolfinx.algebra.kept_factor import KeptFactor
 from uem_dolfinx.algebra.ksp import KspOfOptions
 from uem_dolfinx.algebra.options import NO_SUCH_TYPE, check_options, last_words, options_in_turn, tell_unused

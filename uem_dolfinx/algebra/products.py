@@ -17,8 +17,17 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, places_of, product, summed, to_owners, together
-from uem_dolfinx.algebra.entries import Entries, blocks_of
+from uem_dolfinx.algebra.blocks import (
+    Blocks,
+    Entries,
+    blocks_of,
+    blocks_of_matrix,
+    places_of,
+    product,
+    summed,
+    to_owners,
+    together,
+)
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints, among
 from uem_dolfinx.geometry.nodes import Nodes
@@ -130,13 +139,7 @@ class UnitedMatrix:
         return own if own.all() else np.where(own != 0.0, own, np.abs(self._K.values).max(initial=0.0) or 1.0)
 
     def _changes(self, trial: Blocks, test: Blocks, G: Blocks | None) -> tuple[Blocks, Bools]:
-        """Blocks of the products in owned rows, without duplicates, and the mask of blocks to add to K's values ``(k,)`` (collective).
-
-        Args:
-            trial: rows of P at this rank's eliminated nodes, each with a diagonal block.
-            test: rows of Q there.
-            G: curvature in owned rows, or None.
-        """
+        """Blocks of the products in owned rows, without duplicates, and the mask of blocks to add to K's values ``(k,)`` (collective)."""
         space, first, last = self.space, self.space.first, self.space.first + self.space.n_owned
         own = np.unique(trial.row)
         eliminated = np.zeros(last - first, dtype=bool)

@@ -20,7 +20,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.algebra import mumps
-from uem_dolfinx.algebra.entries import is_symmetric, stiffen
+from uem_dolfinx.algebra.blocks import is_symmetric, stiffen
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Bools, Ints
@@ -63,7 +63,6 @@ class Condensation:
         space: the space that K acts on.
         trial: T of the motion.
         test: T of the forces; the same object if both have the same weights.
-        K: the tangent.
         G: the curvature, or None.
 
     Attributes:

@@ -374,11 +374,7 @@ class Restriction:
 
 
 def _fading(parts: PETSc.Mat) -> int:
-    """Number of powers after which the series in rings has decayed to rounding; 0 if it decays too slowly (collective).
-
-    Args:
-        parts: magnitudes of the coefficients with which equations follow each other ``(m, m)``.
-    """
+    """Number of powers of these magnitudes ``(m, m)`` after which the series in rings is rounding; 0 if it decays too slowly."""
     at = parts.createVecRight()
     at.set(1.0)
     for length in range(1, MOST_ROUND + 1):

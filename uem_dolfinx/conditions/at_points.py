@@ -102,7 +102,6 @@ class AtPoints:
     """All loads and springs at nodes of a problem (collective).
 
     Args:
-        config: configuration of the displacement.
         declared: loads and springs as declared by users.
         couplings: attached; their forces and moments act at nodes, too.
     """

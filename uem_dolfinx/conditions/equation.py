@@ -11,14 +11,16 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 from dolfinx import fem
 
-from uem_dolfinx import given
+from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.conditions.places import COINCIDENT, NEAR, described, global_nodes, middle_of, nodes_at, partners
 from uem_dolfinx.errors import InputError, InputTypeError, SurfaceError
+from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.tags import Part, name_of
+from uem_dolfinx.geometry.tags import Part, as_tag, name_of
 from uem_dolfinx.parallel import agree, agreed, ask_together, gathered, reduced
 
 Value: TypeAlias = "npt.ArrayLike | fem.Constant | Callable[[float], Any]"
@@ -307,3 +309,63 @@ def values_of(name: str, value: Any, size: int | None) -> Array:
         remedy = "a single number has no direction" if array.shape == (1,) and np.isfinite(array[0]) else ""
         raise InputError(given.sentence(name, value.value if held else value, words, remedy))
     return np.zeros(size) if zero and size else array
+
+
+class MeanMotion(given.Sealed):
+    """The mean of a displacement component over a part: ``integral of inner(c, u) / integral of 1 = b``.
+
+        uem.MeanMotion(tags["top"], (0, 1), b=-0.01)                    # the top is lowered by 0.01 in the mean, and stays free to bend
+
+    Pass it to ``UnitedProblem(..., equations=[...])``, which eliminates one component of one node. The part carries the force evenly, as
+    under a uniform traction along c. Several means of one part, as of its components, are several equations.
+
+    Args:
+        part: facets or cells, over which the mean is an integral, or points, over which it is a sum.
+        c: direction of the component, a vector ``(gdim,)`` of any length.
+        b: a number, a ``fem.Constant`` or a function of the load factor or time, ramped as ``b`` of ``Equation``.
+
+    Raises:
+        InputError, InputTypeError: for a vector or values of another form. When the problem is made also a TagError for an invalid part,
+            and a ConflictError if conditions hold all of its nodes.
+    """
+
+    firm = True
+
+    def __init__(self, part: Part, c: npt.ArrayLike, b: Value = 0.0):
+        self._part, self._c = part, given.vector("c", c)
+        self.b = checked_value("b", b, 1)
+
+    @property
+    def places(self) -> list[Any]:
+        """Its part."""
+        return [self._part]
+
+    def n_values(self, block: int) -> int:
+        """See ``LinearEquations``."""
+        return 1
+
+    def rows(self, config: Configuration, role: str) -> GivenRows:
+        """See ``LinearEquations``; all terms are on the first rank, which has one row (collective)."""
+        with agreed(config.comm):
+            c = given.vector(f"c of {role}", self._c, config.block)
+        nodes = nodes_at(config, self._part, f"the part of {role}")
+        weights = self._weights(config, role)[nodes]
+        own = np.flatnonzero(weights != 0.0)
+        every = config.comm.gather((config.to_global(nodes[own]), weights[own]), root=0)
+        none = np.zeros(0, dtype=np.int64)
+        node, weight = (np.concatenate(parts) for parts in zip(*every)) if every else (none, np.zeros(0))
+        # the node of the largest weight is named in messages, and is eliminated if it is free
+        order = np.argsort(-np.abs(weight), kind="stable")
+        coefficients = (weight[order] / (weight.sum() or 1.0))[:, None] * c
+        return GivenRows(np.zeros(min(len(node), 1), np.int64), np.zeros(len(node), np.int64), node[order], coefficients)
+
+    def _weights(self, config: Configuration, role: str) -> Array:
+        """Weights of all owned nodes in the mean, not divided by their sum ``(n_owned,)`` (collective)."""
+        tdim = config.tdim
+        tag = as_tag(self._part, config.mesh, (tdim - 1, *range(tdim + 1)), f"the part of {role}")
+        if tag.dim < tdim - 1:
+            return np.ones(config.n_owned)
+        measure = (forms.surface_measure if tag.dim == tdim - 1 else forms.cell_measure)(config.mesh, tag.entities, {})
+        V = compat.function_space(config.mesh, config.degree)
+        found = forms.assemble_array(V, forms.form(revolved(ufl.TestFunction(V) * measure)))
+        return np.asarray(found[: config.n_owned])

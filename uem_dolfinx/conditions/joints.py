@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.conditions.pair_motion import RA, RB, TA, TB, Body, Scalar, angle, distance, projected, turning
+from uem_dolfinx.conditions.relations import RA, RB, TA, TB, Body, Scalar, angle, distance, projected, turning
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.conditions.rigid_set import Placement
 from uem_dolfinx.errors import InputError, SpaceError

@@ -23,7 +23,6 @@ class Linked:
     """Joints and springs of couplings with a common vector of motions.
 
     Args:
-        couplings: attached.
         links: joints, springs and relations, all of whose ends are among the couplings.
         sets: nodes of the couplings.
     """

@@ -24,14 +24,13 @@ from dolfinx import fem
 
 from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.conditions.independent_rows import Basis, chosen
 from uem_dolfinx.conditions.joints import Link
 from uem_dolfinx.conditions.linked import Linked
 from uem_dolfinx.conditions.relations import Relation
-from uem_dolfinx.conditions.right_sides import is_ramped
-from uem_dolfinx.conditions.rigid_basis import Basis, chosen
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling, nearest_turn
 from uem_dolfinx.conditions.rigid_set import Placement, RigidSets, moments, turned, velocities
-from uem_dolfinx.conditions.united_rows import CONTRADICTING
+from uem_dolfinx.conditions.united_rows import CONTRADICTING, is_ramped
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.rigid import Motion, rotation_matrix
@@ -69,8 +68,6 @@ class RigidRows:
     """Constraint equations of one coupling, or of several with joints and springs between them (collective).
 
     Args:
-        config: configuration of the displacement.
-        couplings: attached.
         links: joints, springs and relations, all of whose ends are among the couplings.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
         avoided: mask of owned nodes of contacts, which are preferably eliminated ``(n_owned,)``.

@@ -79,7 +79,6 @@ class RigidSet:
     """Nodes of a rigid coupling, with its point (collective).
 
     Args:
-        config: configuration of the displacement.
         nodes: owned nodes.
         point: moves with the nodes, reference position ``(gdim,)``.
         large: whether rotations are finite.

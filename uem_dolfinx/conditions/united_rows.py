@@ -2,22 +2,75 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
+from dolfinx import fem
+from ufl.core.expr import Expr
+from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.conditions.equation import GivenRows
+from uem_dolfinx.conditions.equation import GivenRows, LinearEquations, values_of
 from uem_dolfinx.conditions.independent_rows import Solved, divided, eliminated, singles, sizes
-from uem_dolfinx.conditions.right_sides import RightSides
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Halo
-from uem_dolfinx.parallel import Exchange, agree, reduced
+from uem_dolfinx.parallel import Exchange, agree, agreed, ask_together, reduced
+
+
+class RightSides:
+    """Values b of declared equations, one after the other (collective).
+
+    Args:
+        declared: the equations as users declared them.
+        loaded: Constants that the load sets; other values are ramped with the Dirichlet values.
+        at: load factor or time of the first evaluation of functions.
+
+    Attributes:
+        first: number of the first value of each declaration, and the number of all.
+        ramped: mask of values that are ramped ``(n_values,)``.
+    """
+
+    def __init__(self, config: Configuration, declared: Sequence[LinearEquations], loaded: Collection[fem.Constant], at: float):
+        self._comm, self._block, self.declared = config.comm, config.block, list(declared)
+        counts = [one.n_values(config.block) for one in self.declared]
+        self.first: Ints = np.cumsum([0, *counts])
+        self.ramped: Bools = np.repeat([is_ramped(one.b, loaded) for one in self.declared], counts).astype(bool)
+        self._evaluated: list[Any] = [None] * len(counts)
+        self.take_load(at)
+
+    def take_load(self, at: float) -> None:
+        """Evaluate functions at a load factor or time; UserFunctionError if a function raises (collective)."""
+        for i, one in enumerate(self.declared):
+            if callable(one.b) and not isinstance(one.b, fem.Constant):
+                self._evaluated[i] = ask_together(self._comm, f"the value of equations[{i}] at {at:.6g}", one.b, at)
+
+    def by_name(self) -> dict[str, Any]:
+        """Present right-hand sides, by name."""
+        now = [one.b if known is None else known for one, known in zip(self.declared, self._evaluated)]
+        return {f"the value of equations[{i}]": value for i, value in enumerate(now)}
+
+    def values(self) -> Array:
+        """Present right-hand sides ``(n_values,)`` (collective)."""
+        with agreed(self._comm):
+            found = [
+                values_of(name, value, one.n_values(self._block))
+                for one, (name, value) in zip(self.declared, self.by_name().items())
+            ]
+        return np.concatenate([np.zeros(0), *found])
+
+
+def is_ramped(b: Any, loaded: Collection[fem.Constant]) -> bool:
+    """Whether a right-hand side is ramped with the Dirichlet values; functions and what contains ``loaded`` Constants are not."""
+    if isinstance(b, Expr):
+        return not any(one is constant for one in traverse_unique_terminals(b) for constant in loaded)
+    return not callable(b)
+
 
 #: Equations that were left out because they follow from others hold up to this part of the displacements and values in them.
 #: [convention; displacements and values; test_equation.py::test_what_contradicts]
@@ -28,7 +81,6 @@ class UnitedRows:
     """All linear equations of a problem (collective).
 
     Args:
-        config: configuration of the displacement.
         sides: right-hand sides.
         rows: this rank's equations, with values numbered as in ``sides``.
         item: number of the declaration of each ``(m,)``.

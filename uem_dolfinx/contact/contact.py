@@ -17,6 +17,7 @@ from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of
 from uem_dolfinx.contact.laws.law import (
     Field,
     FrictionLaw,
+    OfTemperature,
     as_law,
     given_field,
     given_friction,
@@ -28,7 +29,6 @@ from uem_dolfinx.contact.laws.law import (
     parameters,
     values_at,
 )
-from uem_dolfinx.contact.laws.thermal import OfTemperature
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.kinds import PartsOfPair, heats_of_kind, kind_of_interface, tie_of, wear_of
 from uem_dolfinx.contact.seam.placement import Discretisation, Kinematics
@@ -46,10 +46,9 @@ from uem_dolfinx.parallel import agreed, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.friction.sliding import Sliding
-    from uem_dolfinx.contact.laws.adhesion import Adhesion
     from uem_dolfinx.contact.laws.cohesive import Cohesive
     from uem_dolfinx.contact.laws.leak import Leak
-    from uem_dolfinx.contact.laws.soft import SoftContact
+    from uem_dolfinx.contact.laws.soft import Adhesion, SoftContact
     from uem_dolfinx.contact.mortar.discretisation import Mortar
     from uem_dolfinx.contact.offsets import Offsets
 

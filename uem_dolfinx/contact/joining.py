@@ -6,16 +6,20 @@ from collections.abc import Hashable, Sequence
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
-from uem_dolfinx.arrays import Bools
+from mpi4py import MPI
+
+import numpy as np
+
+from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.laws.coulomb import Coulomb
-from uem_dolfinx.contact.laws.law import FrictionLaw, as_law
-from uem_dolfinx.contact.laws.thermal import OfTemperature
-from uem_dolfinx.contact.shared_pressures import refuse_shared_pressures
-from uem_dolfinx.errors import InputError
+from uem_dolfinx.contact.laws.law import FrictionLaw, OfTemperature, as_law
+from uem_dolfinx.errors import ConflictError, InputError
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.tags import Tag
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.contact import Contact
     from uem_dolfinx.contact.further.part import FurtherPart
     from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.pair.kinds import PartsOfPair
@@ -38,11 +42,7 @@ def attached(
 
 
 def _further_parts(contact: Contact, config: Configuration, free: Bools, clock: dict[str, Any]) -> Sequence[FurtherPart]:
-    """Attached further parts of a contact, at corners and edges (collective).
-
-    Raises:
-        InputError: for a contact that cannot have what it is given.
-    """
+    """Attached further parts of a contact, at corners and edges; InputError if it cannot have what it is given (collective)."""
     wanted = [word for word in ("corners", "edges") if getattr(contact, word)]
     found: list[FurtherPart] = []
     if wanted and not _takes_parts(contact):
@@ -53,11 +53,11 @@ def _further_parts(contact: Contact, config: Configuration, free: Bools, clock: 
         )
     order = -1 - next(_orders) if wanted else -1
     if contact.corners:
-        from uem_dolfinx.contact.further.corners import corners_of
+        from uem_dolfinx.contact.further.part import corners_of
 
         found += corners_of(contact, config, order)
     if contact.edges:
-        from uem_dolfinx.contact.further.edges import edges_of
+        from uem_dolfinx.contact.further.part import edges_of
 
         found += edges_of(contact, config, order)
     for part in found:
@@ -99,7 +99,7 @@ def _pairs_of(contacts: Sequence[Contact], made: Sequence[PartsOfPair], together
         if len(alike) == 1:
             found[alike[0]] = made[alike[0]].alone()
         else:
-            from uem_dolfinx.contact.pair.joined import JoinedInterface
+            from uem_dolfinx.contact.pair.joined_nodes import JoinedInterface
 
             parts = [made[k] for k in alike]
             found |= zip(alike, JoinedInterface(parts).make_members(parts))
@@ -127,3 +127,57 @@ def _kind(contact: Contact, made: PartsOfPair) -> Hashable:
 def _joins(law: FrictionLaw) -> bool:
     """Whether a law is Coulomb's, independent of temperature."""
     return type(law) is Coulomb and not isinstance(law.field, OfTemperature)
+
+
+def refuse_shared_pressures(config: Configuration, contacts: Sequence[Contact]) -> None:
+    """Refuse contacts on the same facets of both sides of which one has a law of the pressure (collective).
+
+    Friction and wear are such laws if both contacts have the same contactor; a conductance that depends on the pressure also if the sides
+    are swapped.
+
+    Args:
+        config: configuration of the displacement.
+        contacts: all its contacts.
+
+    Raises:
+        ConflictError: naming two such contacts.
+    """
+    facets = config.tdim - 1
+    single = [one for one in contacts if not one.of_all_surfaces and one.tied is not True and one.contactor.dim == facets]
+    laws = [one.normal is not None or one.cohesion is not None for one in single]
+    conducts = np.array([law or any(callable(heat.h) for heat in one.heats) for law, one in zip(laws, single)], dtype=bool)
+    slides = np.array([one.pair.friction is not None for one in single], dtype=bool)
+    if len(single) < 2 or not (conducts | slides).any():
+        return
+    own, theirs = _tables([one.contactor for one in single], [one.target for one in single])
+    common = np.stack([(one @ other.T).toarray() > 0 for one, other in ((own, own), (theirs, theirs), (own, theirs))])
+    config.comm.Allreduce(MPI.IN_PLACE, common, op=MPI.LOR)
+    contactors, targets, swapped = common
+    rigid = np.array([id(one.target) for one in single])
+    targets |= rigid[:, None] == rigid
+    law = conducts | slides
+    np.fill_diagonal(contactors, False)
+    twice: Bools = contactors & targets & (law[:, None] | law)
+    both_ways: Bools = swapped & swapped.T & (conducts[:, None] | conducts)
+    for i, j in np.argwhere(np.triu(twice | both_ways)):
+        one, other = single[i], single[j]
+        which = "surfaces" if twice[i, j] else "surfaces with the sides swapped"
+        remedy = "declare one contact with all friction, wear and conductances, heat=[...]"
+        raise ConflictError(
+            f"contact '{one.name}' and contact '{other.name}' have the same {which}, and share the pressure: friction, wear, p(g) or "
+            f"h(p, g) of a part of it would be wrong: {remedy if twice[i, j] else 'keep one of the two'}"
+        )
+
+
+def _tables(*sides: Sequence[object]) -> list[Any]:
+    """Sparse masks of this rank's facets in the tags of each side, without facets for rigid surfaces."""
+    from scipy.sparse import csr_matrix
+
+    none: Indices = np.zeros(0, np.int32)
+    lists = [[tag.entities if isinstance(tag, Tag) else none for tag in tags] for tags in sides]
+    n = 1 + max(int(entities.max(initial=0)) for side in lists for entities in side)
+    found = []
+    for side in lists:
+        every, starts = np.concatenate(side), np.cumsum([0, *(len(entities) for entities in side)])
+        found.append(csr_matrix((np.ones(len(every)), every, starts), shape=(len(side), n)))
+    return found

@@ -22,7 +22,6 @@ class Offsets:
     """Heights minus gaps at the contactors of one interface.
 
     Args:
-        pair: the interface.
         name: of its contact, for messages.
 
     Attributes:

@@ -25,7 +25,7 @@ from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.laws.conductance import Conductance
-    from uem_dolfinx.contact.mortar.seam import Seam
+    from uem_dolfinx.contact.mortar.rows import Seam
 
 
 #: Smaller areas, over those of nodes around, are zero to rounding.
@@ -178,7 +178,7 @@ class ContactResults(HeatResults):
     def _seam(self) -> Seam:
         """Contactors that equations of users give one displacement (first time: collective)."""
         from uem_dolfinx.conditions.seams import seams_of
-        from uem_dolfinx.contact.mortar.seam import Seam
+        from uem_dolfinx.contact.mortar.rows import Seam
 
         return Seam(self.config, self.nodes, seams_of(self.config))
 
@@ -248,8 +248,8 @@ class ContactResults(HeatResults):
         It differs from :attr:`pressure` at degree 2, and with mortar where the contactor overhangs the target. At sharp edges of
         the contactor, integrate over the facets that face the target. It is zero for contactors given as points.
         """
-        from uem_dolfinx.contact.mortar.densities import density
         from uem_dolfinx.contact.mortar.duals import basis_of
+        from uem_dolfinx.contact.mortar.rows import density
 
         f = self._field("pressure_to_integrate", 0.0)
         if self.contactor.dim > 0:

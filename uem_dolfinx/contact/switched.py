@@ -13,8 +13,7 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, follows_load
-from uem_dolfinx.contact.laws.thermal import OfTemperature
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, OfTemperature, as_law, follows_load
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.contact.ties.tie import Tie

@@ -28,11 +28,10 @@ from uem_dolfinx.decks.parts import SAME_LENGTH, TEMPERATURE, Course, Interactio
 from uem_dolfinx.dynamics.mass import consistent_mass
 from uem_dolfinx.errors import InputError, MissingFileError, SpaceError, TagError
 from uem_dolfinx.geometry.axisymmetry import axisymmetric
-from uem_dolfinx.geometry.cuts import BACK, cut
+from uem_dolfinx.geometry.cuts import BACK, RawMesh, cut
 from uem_dolfinx.geometry.decks import found_of, read_numbers
 from uem_dolfinx.geometry.gmsh import distributed
 from uem_dolfinx.geometry.mesh_files import raw_of
-from uem_dolfinx.geometry.raw import RawMesh
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
 from uem_dolfinx.materials.elastic import LinearElastic, StVenantKirchhoff
@@ -43,7 +42,7 @@ from uem_dolfinx.solve.modes import Vibrations, modes
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
-from uem_dolfinx.solve.steps.step import Step as OfUsers
+from uem_dolfinx.solve.steps.stages import Step as OfUsers
 
 #: Kinds of strains by the first letters of element types.
 STRAINS_OF_TYPES = {"C3D": "3d", "CPE": "plane_strain", "CPS": "plane_stress", "CAX": "axisymmetric"}

@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import ufl
 
-from uem_dolfinx.contact.laws.exponential import Exponential
-from uem_dolfinx.contact.laws.soft import SoftContact
+from uem_dolfinx.contact.laws.soft import Exponential, SoftContact
 from uem_dolfinx.errors import InputError
 
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.

@@ -19,8 +19,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.conditions.rigid_set import Placement, moments, turned, velocities
-from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
-from uem_dolfinx.dynamics.scheme import Scheme
+from uem_dolfinx.dynamics.scheme import CentralDifferences, Scheme
 from uem_dolfinx.parallel import gathered
 
 

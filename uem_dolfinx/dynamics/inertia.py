@@ -20,9 +20,8 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
 from uem_dolfinx.dynamics.mass import Mass
-from uem_dolfinx.dynamics.scheme import Scheme, newmark
+from uem_dolfinx.dynamics.scheme import CentralDifferences, Scheme, newmark
 from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
@@ -349,7 +348,7 @@ class Dynamics(given.Sealed):
             raise NotFiniteError(
                 f"the forces at the start, time {self.time:.6g}, contain NaN or infinity: check loads, Dirichlet values and displacement"
             )
-        from uem_dolfinx.dynamics.first_acceleration import united_accelerations
+        from uem_dolfinx.dynamics.massless import united_accelerations
 
         a = united_accelerations(self.matrix, restriction, -F, added)
         self.acceleration.x.array[: self._n] = a.array_r[: self._n] * self.massy.ravel()

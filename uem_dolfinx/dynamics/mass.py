@@ -238,13 +238,7 @@ class Mass:
         return self._products(fields, momenta), momenta
 
     def _unable(self, here: Bools, needed: Bools, distance: Array | None) -> MassError:
-        """The error for a body whose other nodes cannot take the mass of some nodes (collective).
-
-        Args:
-            here: mask of nodes of the body ``(n_owned,)``.
-            needed: mask of nodes of any body that should be massless ``(n_owned,)``.
-            distance: distances of these nodes from the surfaces that they may touch ``(n_owned,)``, or None.
-        """
+        """Error for a body, its mask ``here``, whose other nodes cannot take the mass of ``needed`` ones (collective)."""
         heavy = self.of_nodes.any(axis=1) & here
         sums = [here.sum(), (heavy & needed).sum(), (heavy & ~needed).sum(), *self._X[here].sum(axis=0)]
         n, contactors, others, *x = reduced(self.config.comm, np.array(sums, dtype=float))
@@ -259,10 +253,7 @@ class Mass:
         )
 
     def _possible_part(self, needed: Bools, here: Bools, distance: Array) -> str:
-        """Words for the body's nodes that could be massless: those nearest to the surfaces that they may touch (collective).
-
-        Arguments as in ``_unable``.
-        """
+        """Words for the body's nodes that could be massless: those nearest to the surfaces that they may touch (collective)."""
         comm, body = self.config.comm, self._bodies[0]
         number = reduced(comm, int(body[here].max(initial=-1)), op=MPI.MAX)
         # equally near nodes are treated together

@@ -3,6 +3,8 @@
 A contactor and the target nodes below it move together. Mass on either side and the cells of both surfaces would form an oscillator with
 the highest frequency of the meshes. Impact excites it, nothing damps it, and the trapezoidal rule adds energy whenever the contact opens.
 Without mass on both sides the contact force is the static reaction of the gap.
+
+The initial acceleration of bodies under forces is that of the constrained nodes with mass.
 """
 
 from __future__ import annotations
@@ -12,15 +14,19 @@ from collections.abc import Callable, Sequence
 from mpi4py import MPI
 
 import numpy as np
+from petsc4py import PETSc
 
+from uem_dolfinx import forms
+from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.dynamics.mass import Mass
+from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes, surface_nodes, tributary_areas
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.log import logger
+from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import reduced
 
 
@@ -118,3 +124,38 @@ def _stiffness_per_area(config: Configuration, part: object, K: Array) -> float:
     nodes = surface_nodes(config, part)
     total, area = reduced(config.comm, np.array([K[nodes].sum(), tributary_areas(config, part)[nodes].sum()]))
     return float(total / area) if area > 0.0 and np.isfinite(total) else 0.0
+
+
+#: Components with less mass than this part of the largest have no acceleration at the start.
+#: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
+MASSLESS = 1e-12
+#: Relative tolerance of the residual of the first acceleration.
+#: [bound; forces; -]
+ACCELERATED = 1e-13
+
+
+def united_accelerations(
+    mass: PETSc.Mat, restriction: Restriction, forces: PETSc.Vec, added: PETSc.Mat | None = None
+) -> PETSc.Vec:
+    """``P a`` with ``P'MP a = P' forces``, zero in components without mass (collective).
+
+    Args:
+        mass: M, with the rows and columns of the constrained system.
+        restriction: P.
+        forces: on all unknowns.
+        added: masses at points, in addition to M.
+
+    Raises:
+        LinearSolveError: if masses are negative.
+    """
+    M = mass.copy() if restriction.alone else mass.PtAP(restriction.P)
+    if restriction.alone:
+        restriction.cross_out(M)
+    if added is not None:
+        M.axpy(1.0, added.PtAP(restriction.P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    rhs = restriction.transpose(forces)
+    with timed("first acceleration"):
+        q, reason = forms.solve_mass(M, rhs, MASSLESS, ACCELERATED)
+    if reason < 0:
+        raise LinearSolveError(f"the first acceleration was not found (KSP reason {reason}): check that no mass is negative")
+    return restriction.expand(q)

@@ -41,9 +41,6 @@ class ByState:
 class RateSlopes:
     """Derivatives through the time steps of a problem, from the last to the first.
 
-    Args:
-        dynamics: of the problem.
-
     Attributes:
         by: derivatives by the final state of the present step, and by its initial state after ``pass_back``; zero at first.
     """
@@ -143,7 +140,6 @@ class RateChanges(RateSlopes):
     """Changes through the time steps of a problem along a direction, from the first to the last; ``by`` is the change of the state.
 
     Args:
-        dynamics: of the problem.
         density: change of the logarithm of the density of all mass.
     """
 

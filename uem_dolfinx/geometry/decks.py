@@ -117,15 +117,7 @@ def found_of(deck: Deck, path: Path) -> Found:
 
 
 def _keywords(path: Path, around: tuple[Path, ...] = ()) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
-    """Keywords and options in capitals, with their data rows; included files are inserted in place.
-
-    Args:
-        path: of the file.
-        around: files that include it.
-
-    Raises:
-        MeshError: if an included file is missing, or includes itself.
-    """
+    """Keywords and options in capitals, with data rows, of a file and those it includes; MeshError if one is missing or includes itself."""
     keyword, options, rows = "", dict[str, str](), list[list[str]]()
     lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
     for line in lines:

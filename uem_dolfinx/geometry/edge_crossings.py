@@ -353,13 +353,7 @@ class Crossings:
         return np.asarray(committed >= -np.maximum(EDGES_BEHIND * shorter, self._overlap))
 
     def _opposite(self, gaps: EdgeGaps, within: Array, ends: Bools) -> Bools:
-        """Which pairs of pieces are opposite to each other ``(k,)``.
-
-        Args:
-            gaps: between the pieces.
-            within: see ``_within`` ``(k,)``.
-            ends: as in ``Opposite``.
-        """
+        """Which pairs of pieces, with these gaps, are opposite to each other ``(k,)``; ``ends`` as in ``Opposite``."""
         g, lengths = gaps.gap, (_lengths(gaps.x), _lengths(gaps.y))
         shorter, longer = np.minimum(*lengths), np.maximum(*lengths)
         inside: Bools = (gaps.sine > EDGES_PARALLEL) & (g <= REACH * longer) & (g >= -np.maximum(REACH * shorter, self._overlap))

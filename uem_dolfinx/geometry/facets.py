@@ -46,7 +46,6 @@ class TargetFacets:
     """Facets of a surface on this rank, oriented outwards (collective).
 
     Args:
-        config: configuration of the displacement.
         tag: of the surface.
         role: of the surface, for messages.
 

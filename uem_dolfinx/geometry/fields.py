@@ -2,6 +2,8 @@
 
 Vectors and matrices of the constrained system have rows of gdim components. On every rank the displacement's nodes come first, then
 the unknowns of all other fields, gdim per row; the last row is padded with fixed components.
+
+A scalar field may also be the only unknown, or be read at the nodes of the displacement.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, is_whole
 from uem_dolfinx.errors import InputError, SpaceError
+from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import Exchange, agreed, gathered, reduced
@@ -298,5 +301,122 @@ def degree_of_displacement(W: Any, i: Any) -> int:
         raise SpaceError(
             f"displacement = {i}: that part of the mixed space has {max(components, 1)} component(s)"
             f"{'' if degree else ' and is no Lagrange space'}, expected a vector Lagrange space of size {g}{remedy}"
+        )
+    return degree
+
+
+class ScalarConfiguration(Configuration):
+    """Nodes of a scalar Lagrange space; arrays of its values have one component, ``(n, 1)``, where others have gdim.
+
+    Raises:
+        SpaceError: if ``u`` is in no Lagrange space of degree 1 or 2, or on a surface in space.
+    """
+
+    moves, name = False, "field"
+
+    def _take(self, V: Any) -> None:
+        degree, self.tdim = compat.lagrange_degree(V), V.mesh.topology.dim
+        if degree not in (1, 2) or self.tdim != V.mesh.geometry.dim:
+            raise SpaceError(
+                f"u is a scalar field of a space {V.ufl_element()} on cells of dimension {self.tdim} in {V.mesh.geometry.dim}D: expected "
+                "a Lagrange space of degree 1 or 2 on cells of the dimension of their space"
+            )
+        self.degree: int = degree
+        Nodes.__init__(self, V)
+        self.axisymmetric = is_axisymmetric(V.mesh)
+
+    def place_of(self, unknown: int) -> str:
+        """Position of the node of a local unknown, for error messages."""
+        return f"the value at {self.describe(unknown)}"
+
+    @property
+    def x(self) -> Array:
+        """Positions of the local nodes ``(n_local, gdim)``: the reference positions."""
+        return self.X
+
+    def modes(self, centred: bool = False) -> Array:
+        """The constant field, which conduction does not resist ``(n_owned, 1, 1)``."""
+        return Nodes.modes(self, centred)
+
+    def of_circles(self, vectors: Array) -> Array:
+        """The unchanged vectors: sums of scalars around an axis do not cancel."""
+        return vectors
+
+
+class NodalField:
+    """Values of a field at nodes, interpolated from the unknowns of one cell with its shape functions.
+
+    Args:
+        config: displacement among other fields.
+        part: number of the field in the mixed space.
+        what: user of the field, for messages.
+
+    Attributes:
+        unknowns: local unknowns of the mixed space for the value at each local node ``(n_local, k)``.
+        weights: weights of these unknowns ``(n_local, k)``.
+
+    Raises:
+        InputError, SpaceError: if the space has no such part, or if it is not a scalar Lagrange field of at most the displacement's
+            degree.
+    """
+
+    def __init__(self, config: ConfigurationAmongFields, part: int, what: str):
+        self.config, self.part = config, part
+        W = config.whole.function_space
+        degree = _degree(config, part, what)
+        cell = compat.cell_name(config.mesh)
+        points = forms.create_lagrange_element(cell, config.degree).points
+        # values are multiples of 1/8, for degree 1 at nodes of degree 2, or 1
+        shape = np.rint(8.0 * forms.create_lagrange_element(cell, degree).tabulate(0, points)[0, :, :, 0]) / 8.0
+        nodes, own = compat.cell_dofs(config.V), compat.part_dofs(W, part)
+        # unknowns of the cell by their weight at each node, the largest first
+        k = int((shape != 0).sum(axis=1).max())
+        order = np.argsort(-np.abs(shape), axis=1, kind="stable")[:, :k]
+        self.unknowns: Ints = np.zeros((config.n_local, k), dtype=np.int64)
+        self.weights: Array = np.zeros((config.n_local, k))
+        if len(nodes):
+            self.unknowns[nodes] = own[:, order]
+            self.weights[nodes] = np.take_along_axis(shape, order, axis=1)
+
+    @property
+    def values(self) -> Array:
+        """Values at the owned nodes ``(n_owned,)``."""
+        n = self.config.n_owned
+        return np.asarray((self.weights[:n] * self.config.whole.x.array[self.unknowns[:n]]).sum(axis=1))
+
+    def terms(self, nodes: Ints) -> Array:
+        """Global vector components for the values at owned ``nodes (m,)``, followed by their weights ``(m, 2 k)``."""
+        return np.column_stack([self.config.unknowns.numbers[self.unknowns[nodes]], self.weights[nodes]])
+
+    def rows(self, nodal: Array) -> Array:
+        """Nodal amounts ``nodal (n_owned,)`` as terms of the field's equations, in rows of vectors ``(n_rows * gdim,)`` (collective)."""
+        from dolfinx import fem
+
+        n, sent = self.config.n_owned, fem.Function(self.config.whole.function_space)
+        np.add.at(sent.x.array, self.unknowns[:n].ravel(), (self.weights[:n] * nodal[:, None]).ravel())
+        forms.sum_ghosts(sent)
+        return np.asarray(self.config.rows(sent.x.array[: len(self.config.unknowns.place)]).ravel())
+
+
+def nodal_field(config: ConfigurationAmongFields, part: int, what: str) -> NodalField:
+    """The field of a part at nodes, made once; arguments and errors as for ``NodalField``."""
+    if part not in config.nodal_fields:
+        config.nodal_fields[part] = NodalField(config, part, what)
+    found: NodalField = config.nodal_fields[part]
+    return found
+
+
+def _degree(config: Any, part: int, what: str) -> int:
+    """Degree of the field, which must not exceed the displacement's degree."""
+    W = config.whole.function_space
+    others = [i for i in range(W.num_sub_spaces) if i != config.part]
+    if part not in others:
+        raise InputError(f"{what}: field = {part}: expected the number of a part other than the displacement, one of {others}")
+    V = W.sub(part)
+    degree = compat.lagrange_degree(V)
+    if V.num_sub_spaces or degree is None or degree > config.degree:
+        raise SpaceError(
+            f"{what}: part {part} of the mixed space is no scalar Lagrange field of degree {config.degree} or less, whose "
+            "values the contactors' nodes determine: give the field such an element, or the displacement a higher degree"
         )
     return degree

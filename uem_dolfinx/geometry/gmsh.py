@@ -18,9 +18,8 @@ from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
 from uem_dolfinx.geometry.cells import check_edges, check_nodes, check_volumes
-from uem_dolfinx.geometry.cuts import cut_along
+from uem_dolfinx.geometry.cuts import Group, RawMesh, cut_along
 from uem_dolfinx.geometry.mesh_sizes import MeshSizes
-from uem_dolfinx.geometry.raw import Group, RawMesh
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
@@ -191,13 +190,7 @@ def _included(path: Path, known: tuple[Path, ...] = ()) -> list[Path]:
 
 
 def _whole(path: Path, folder: Path, copies: dict[Path, Path]) -> Path:
-    """A copy of a .geo file and of those it includes whose last lines end, since Gmsh loses statements on lines that do not.
-
-    Args:
-        path: of the file.
-        folder: of the copies, which name other files by their places.
-        copies: that there are already, by the files.
-    """
+    """A copy in ``folder`` of a .geo file and of those it includes whose last lines end: Gmsh loses statements on lines that do not."""
     if path in copies:
         return copies[path]
     copies[path] = folder / f"{len(copies)} {path.name}"

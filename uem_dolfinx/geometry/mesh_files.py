@@ -16,11 +16,10 @@ import numpy as np
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
-from uem_dolfinx.geometry.cuts import cut_along
+from uem_dolfinx.geometry.cuts import Group, RawMesh, cut_along
 from uem_dolfinx.geometry.found import KINDS, Found, from_meshio
 from uem_dolfinx.geometry.gmsh import checked, distributed, read_gmsh
-from uem_dolfinx.geometry.raw import Group, RawMesh
-from uem_dolfinx.geometry.serendipity import completed
+from uem_dolfinx.geometry.simplices import completed
 from uem_dolfinx.geometry.tags import Tags
 from uem_dolfinx.log import logger
 

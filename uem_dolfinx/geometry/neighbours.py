@@ -18,10 +18,9 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
-from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, balls_that_meet
+from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, RankBoxes, balls_that_meet
 from uem_dolfinx.geometry.facets import FacetData, heights
 from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.geometry.rank_boxes import RankBoxes
 from uem_dolfinx.geometry.search import Feet, MeshTarget
 from uem_dolfinx.geometry.shapes import closest_point
 from uem_dolfinx.geometry.skin import Apart, Skin
@@ -251,13 +250,7 @@ class Neighbours:
         return np.asarray(faces & np.where(inside[pair], beside, front | (beside & (front & faces)[nearest])))
 
     def _open_sides(self, row: Ints, facet: Ints, across: Ints) -> Bools:
-        """Sides of facets beyond which no facet is listed for the same node: closest points there are past an end ``(k, n_sides)``.
-
-        Args:
-            row: places of nodes ``(k,)``.
-            facet: numbers of the facets listed for them, over all ranks.
-            across: numbers of their neighbours ``(k, n_sides)``, -1 for no neighbour.
-        """
+        """Sides of facets beyond which no facet is listed for the same node: closest points there are past an end ``(k, n_sides)``."""
         most = self.skin.first[-1]
         listed = np.sort(row * most + facet)
         asked = np.where(across >= 0, row[:, None] * most + across, -1)
@@ -319,14 +312,7 @@ class Neighbours:
         return np.asarray(height >= -BEHIND * np.minimum(skin.depth, skin.radius)[facet])
 
     def _first_of_itself(self, of: Asking, node: Ints, facet: Ints, cosines: Array) -> Bools:
-        """In self-contact, decide for each pair which side is the contactor: True where the node follows the facet ``(k,)``.
-
-        Args:
-            of: the nodes.
-            node: their indices ``(k,)``.
-            facet: of this rank.
-            cosines: between the facet's normal and the normals of the facets around the node ``(k, c)``.
-        """
+        """In self-contact, decide for each pair which side is the contactor: True where the node follows the facet ``(k,)``."""
         skin, d = self.skin, DIRECTION[: self._config.gdim]
         middle, normal = skin.middles(self._config.X[skin.dofs])
         # reference normal, around the node, that faces the facet most directly
@@ -335,13 +321,7 @@ class Neighbours:
         return np.asarray((own - normal[facet] + (of.drawn[node] - middle[facet]) / self._config.size) @ d > 0)
 
     def _shared_out(self, row: Ints, body: Ints, distance: Array) -> Ints:
-        """Body of each node on each list, -1 for no body ``(n_lists, n)``: first the body that holds the node now, then the nearest.
-
-        Args:
-            row: places of nodes ``(k,)``.
-            body: bodies near them.
-            distance: of a node from the body.
-        """
+        """Body of each node on each list, -1 for no body ``(n_lists, n)``: first the body that holds the node now, then the nearest."""
         order = np.lexsort((body, distance, row))
         row, body = row[order], body[order]
         # several ranks may report the same body

@@ -89,7 +89,6 @@ class AlongEdges(AtEdges):
     """Nodes of edges that lie along an edge of the surface that they touch: its nodes follow them, as they do without.
 
     Args:
-        config: configuration of the displacement.
         target: of the nodes.
         sides: sides of its facets on edges ``(m, n_sides)``.
         part: distance from an edge, as part of the facet.

@@ -13,10 +13,9 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, replace
-from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, candidate_pairs
+from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, RankBoxes, candidate_pairs
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets
 from uem_dolfinx.geometry.projection import FacetProjection
-from uem_dolfinx.geometry.rank_boxes import RankBoxes
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, beneath, closest_point, unit_normals
 from uem_dolfinx.parallel import Exchange, reduced
 

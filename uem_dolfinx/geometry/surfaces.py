@@ -43,7 +43,6 @@ class Areas:
     """Integrals of the shape functions over a surface, in the reference and the current configuration.
 
     Args:
-        config: configuration of the displacement.
         tag: of the surface, or of points, which have no area.
         facets: of the surface, if available.
     """

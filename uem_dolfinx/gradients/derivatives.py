@@ -1,6 +1,11 @@
 """Derivatives of forms by controls, differentiated and compiled once for all states.
 
 Also transposed matrices, and values of Functions in spaces with another numbering.
+
+The shape as a control: changes of the positions of a mesh's nodes, in the nodes of a displacement of the same or a higher degree.
+
+Cells of a lower degree than the displacement move the displacement's further nodes by their shape functions, ``V = N W``; derivatives by
+the mesh's nodes are ``N'`` times those by the displacement's.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.solve.problem import UnitedProblem
 
 #: Forms whose derivatives are summed, each with its sign.
@@ -31,7 +37,6 @@ class Derivatives:
         V: space of the displacement, with the nodes for derivatives by positions.
 
     Attributes:
-        F: the residual.
         test: test function of F.
         a: the field, a Function of W.
         work: F along it, a functional.
@@ -150,3 +155,48 @@ def derivatives_of(problem: UnitedProblem) -> Derivatives:
         kept = _KEPT[problem] = Derivatives(F, problem.u.function_space, problem.config.V)
     kept.begin()
     return kept
+
+
+class Places:
+    """Positions of the nodes of a mesh with a displacement.
+
+    Attributes:
+        V: space of the displacement.
+        W: space of vectors at the nodes of the mesh; V if they are the same.
+    """
+
+    def __init__(self, config: Configuration):
+        mesh, self.V = config.mesh, config.V
+        corners = len(forms.reference_topology(compat.cell_name(mesh))[0])
+        own = compat.geometry_dofs(mesh).shape[1]
+        self._degree, self.lower = config.degree, own < compat.cell_dofs(self.V).shape[1]
+        #: Whether a change of the mesh's nodes can be a Function of V.
+        self.known = own == compat.cell_dofs(self.V).shape[1] or (self.lower and own == corners)
+        self.W = compat.function_space(mesh, 1, (config.gdim,)) if self.lower and self.known else self.V
+
+    def at_nodes(self, change: fem.Function) -> fem.Function:
+        """A change in W as a Function of V (collective)."""
+        found = fem.Function(self.V)
+        if self.lower:
+            found.interpolate(change)
+            found.x.scatter_forward()
+        else:
+            found.x.array[:] = values_in(self.V, change)
+        return found
+
+    def back(self, by: fem.Function) -> fem.Function:
+        """Derivative by the nodes of the mesh, a Function of W, from the derivative by those of V (collective)."""
+        if not self.lower:
+            return by
+        g, cell_type, found = self.V.dofmap.index_map_bs, compat.cell_name(self.V.mesh), fem.Function(self.W)
+        points = forms.create_lagrange_element(cell_type, self._degree).points
+        N = forms.create_lagrange_element(cell_type, 1).tabulate(0, points)[0, :, :, 0]
+        nodes, corners = compat.cell_dofs(self.V), compat.cell_dofs(self.W)
+        # each node of V in one cell, on its owner
+        node, first = np.unique(nodes.ravel(), return_index=True)
+        first = first[node < self.V.dofmap.index_map.size_local]
+        cell, i = first // nodes.shape[1], first % nodes.shape[1]
+        shares = N[i][:, :, None] * by.x.array.reshape(-1, g)[nodes[cell, i]][:, None]
+        np.add.at(found.x.array.reshape(-1, g), corners[cell], shares)
+        forms.sum_ghosts(found)
+        return found

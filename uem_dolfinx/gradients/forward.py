@@ -22,12 +22,11 @@ from uem_dolfinx.contact.pair.tables import table_of
 from uem_dolfinx.dynamics.rate_slopes import RateChanges
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
-from uem_dolfinx.gradients.derivatives import Derivatives, along
+from uem_dolfinx.gradients.derivatives import Derivatives, Places, along
 from uem_dolfinx.gradients.gradient import AnyControl
 from uem_dolfinx.gradients.linearised import Motion
 from uem_dolfinx.gradients.mean_slopes import MeanSlopes
 from uem_dolfinx.gradients.parameters import ContactParameter, motion_of
-from uem_dolfinx.gradients.places import Places
 from uem_dolfinx.gradients.records import Record
 from uem_dolfinx.gradients.sweep import (
     LEANS_NO_MORE,

@@ -26,9 +26,16 @@ from uem_dolfinx.form_checks import Control, check_expression, check_functional,
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.gradients.assemblies import constants_of
 from uem_dolfinx.gradients.contact_fields import check_field, fields_of
-from uem_dolfinx.gradients.parameters import ContactParameter, keeps_distance
-from uem_dolfinx.gradients.places import Places
-from uem_dolfinx.gradients.refused import motions_of, refuse_assembly, refuse_parameter, refuse_shape, refuse_soft
+from uem_dolfinx.gradients.derivatives import Places
+from uem_dolfinx.gradients.parameters import (
+    ContactParameter,
+    keeps_distance,
+    motions_of,
+    refuse_assembly,
+    refuse_parameter,
+    refuse_shape,
+    refuse_soft,
+)
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.loading import holds, rules_of, set_by

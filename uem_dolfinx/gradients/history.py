@@ -36,10 +36,10 @@ from uem_dolfinx.gradients.records import Record, Records
 from uem_dolfinx.gradients.sweep import Sweep
 from uem_dolfinx.materials.elastic import material_of
 from uem_dolfinx.parallel import agreed
+from uem_dolfinx.solve.loading import Taken, led_by, uniform
 from uem_dolfinx.solve.memory import Memory, move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps.step import Step
-from uem_dolfinx.solve.taken import Taken, led_by, uniform
+from uem_dolfinx.solve.steps.stages import Step
 
 
 class History(given.Sealed):

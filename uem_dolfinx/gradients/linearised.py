@@ -38,7 +38,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.algebra.entries import is_symmetric
+from uem_dolfinx.algebra.blocks import is_symmetric
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
@@ -47,8 +47,8 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import Control
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
-from uem_dolfinx.gradients.contact_fields import along_field
-from uem_dolfinx.gradients.derivatives import Derivatives, along, derivatives_of, transposed, values_in
+from uem_dolfinx.gradients.contact_fields import PressureSlopes, along_field
+from uem_dolfinx.gradients.derivatives import Derivatives, Places, along, derivatives_of, transposed, values_in
 from uem_dolfinx.gradients.mean_slopes import MeanSlopes
 from uem_dolfinx.gradients.parameters import (
     ContactParameter,
@@ -56,21 +56,18 @@ from uem_dolfinx.gradients.parameters import (
     contactors_of,
     led_for,
     motion_of,
+    refuse_sharp,
     rubbed,
     thickened,
     turned_by,
 )
-from uem_dolfinx.gradients.places import Places
-from uem_dolfinx.gradients.pressure_slopes import PressureSlopes
-from uem_dolfinx.gradients.refused import refuse_sharp
-from uem_dolfinx.gradients.rigid_slopes import Followers, RigidSlopes, shape_slopes_of
-from uem_dolfinx.gradients.shape_slopes import ShapeSlopes
+from uem_dolfinx.gradients.shape_slopes import Followers, RigidSlopes, ShapeSlopes, shape_slopes_of
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.bodies.norms import ratio
+from uem_dolfinx.solve.bodies.field_scales import ratio
 from uem_dolfinx.solve.bodies.tangent import contact_curvature, curvature_of, is_skew, slip_terms, together
+from uem_dolfinx.solve.loading import in_rows, uniform, wanted_by_step
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.taken import in_rows, uniform, wanted_by_step
 from uem_dolfinx.solve.united.rows import BodyState, Rows
 from uem_dolfinx.solve.united.system import CLOSED, BodySystem
 
@@ -103,7 +100,7 @@ class Linearised:
         rows: their equations; ``equations`` lists the equations of each of the problem's ``interfaces``.
         multipliers: of all equations of contacts, and of users ``(m,)``.
         slopes: derivatives by the anchors of each interface, in a recorded step.
-        ramp: shares of the Dirichlet values, see ``solve.taken``, in the rows of vectors ``(n_rows, gdim)``.
+        ramp: shares of the Dirichlet values, see ``solve.loading``, in the rows of vectors ``(n_rows, gdim)``.
     """
 
     P: Restriction
@@ -288,7 +285,7 @@ class Linearised:
         return forms.product(self._K_back, a)
 
     def share(self, m: Control | ContactParameter) -> float:
-        """Share of a control, see ``solve.taken``: 1 unless steps ramp it."""
+        """Share of a control, see ``solve.loading``: 1 unless steps ramp it."""
         return self.problem.progress.taken.of(led_for(m))
 
     def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.friction.pivot import LastStep
+from uem_dolfinx.contact.friction.stick_slip import LastStep
 from uem_dolfinx.contact.mortar.placement import MortarKinematics
 from uem_dolfinx.contact.mortar.turning import Frictional, RowSlopes, at_facets, handing_on, row_slopes, turning
 from uem_dolfinx.contact.pair.interface import Interface

@@ -30,7 +30,7 @@ class Record:
         values: of Constants and Functions in the residual.
         friction: of the interfaces' contactors ``(n,)`` each, or None.
         offsets: of the contacts' contactors ``(n,)`` each, or None.
-        shares: of Constants and offsets, see ``solve.taken``, by their ids.
+        shares: of Constants and offsets, see ``solve.loading``, by their ids.
         held: shares of Dirichlet values, ghosts included ``(n,)``, or one share of all.
         dt: length of a time step; 0 in statics.
         prescribed: what equations, couplings and preloads prescribe.

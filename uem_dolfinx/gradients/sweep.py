@@ -24,10 +24,10 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import forms
-from uem_dolfinx.algebra.entries import is_symmetric
+from uem_dolfinx.algebra.blocks import is_symmetric
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.pair.tables import table_of
-from uem_dolfinx.dynamics.first_acceleration import united_accelerations
+from uem_dolfinx.dynamics.massless import united_accelerations
 from uem_dolfinx.dynamics.rate_slopes import RateSlopes
 from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.gradients.adjoint import Adjoint
@@ -39,7 +39,7 @@ from uem_dolfinx.gradients.linearised import Linearised
 from uem_dolfinx.gradients.mean_slopes import MeanSlopes
 from uem_dolfinx.gradients.parameters import ContactParameter, contactors_of, led_for, motion_of
 from uem_dolfinx.gradients.records import Record
-from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
+from uem_dolfinx.materials.return_slopes import PlasticSlopes
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.tangent import contact_curvature, together
 from uem_dolfinx.solve.memory import Memory
@@ -255,7 +255,7 @@ class LinearisedStep(Linearised):
         self.damped: Array | float = 0.0
 
     def share(self, m: Any) -> float:
-        """Share of a control in the step, see ``solve.taken``."""
+        """Share of a control in the step, see ``solve.loading``."""
         return self._led.get(id(led_for(m)), 1.0)
 
     def _linearise(self) -> None:

@@ -93,14 +93,7 @@ def _minimised(points: _Points, curve: YieldCurve, L: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Step:
-    """Derivatives of the potential of a step, at m points.
-
-    Attributes:
-        slope: first derivative by further flow ``(m, 6)``.
-        hessian: second derivative, regularised by a term for the change of volume ``(m, 6, 6)``.
-        peeq: equivalent plastic strain ``(m,)``.
-        size: norm of the strains ``(m,)``.
-    """
+    """Derivatives of the potential of a step at m points: by further flow ``(m, 6)`` and ``(m, 6, 6)``, with a term for the volume."""
 
     slope: Array
     hessian: Array

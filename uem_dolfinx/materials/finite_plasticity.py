@@ -213,7 +213,7 @@ class FinitePlasticity(VonMises):
         return self._piola
 
     def _slopes_of_return(self) -> tuple[Callable[[Any], Any], Callable[..., ByReturn]]:
-        from uem_dolfinx.materials.logarithmic_slopes import logarithmic_back
+        from uem_dolfinx.materials.return_slopes import logarithmic_back
 
         return lambda w: self._components(self._part(w)), logarithmic_back
 

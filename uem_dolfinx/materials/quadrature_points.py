@@ -40,7 +40,6 @@ class QuadraturePoints:
     """Points of one quadrature rule in some owned cells; all methods use these cells only.
 
     Args:
-        domain: the mesh.
         cells: local indices of owned cells ``(n_cells,)``.
         degree: of the rule; 0 is the cells' centre, for use together with other rules. It is replaced by points close to the centre:
             with a single point, FFCx treats gradients and Jacobians as constant in the cell, also at points of other rules.

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.materials.hardening import YieldCurve
     from uem_dolfinx.materials.layers import Layers
     from uem_dolfinx.materials.logarithmic import Flowed
-    from uem_dolfinx.materials.plastic_slopes import PlasticSlopes
-    from uem_dolfinx.materials.return_slopes import ByReturn
+    from uem_dolfinx.materials.return_slopes import ByReturn, PlasticSlopes
 
 STRAINS = ("small", "green_lagrange")
 #: Expected values of kinematic hardening.
@@ -369,7 +368,7 @@ class VonMises(given.Sealed):
 
     def slopes(self, a: fem.Function, test: Any, onward: bool = False) -> PlasticSlopes:
         """Derivatives through load steps, backwards or ``onward``; arguments as in ``PlasticSlopes`` (collective)."""
-        from uem_dolfinx.materials.plastic_slopes import PlasticChanges, PlasticSlopes
+        from uem_dolfinx.materials.return_slopes import PlasticChanges, PlasticSlopes
 
         kind = PlasticChanges if onward else PlasticSlopes
         return kind(self, self._points, self.stress_in_forms, self._kappa, *self._slopes_of_return(), a, test)

@@ -1,22 +1,165 @@
-"""Prescribed values, loads and springs at points of the undeformed bodies, for sketches."""
+"""The surface of the undeformed bodies, and prescribed values, loads and springs at its points, for sketches."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
+import ufl
 from dolfinx import fem
 
-from uem_dolfinx import compat
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx import compat, forms
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.conditions.places import nodes_at
 from uem_dolfinx.geometry.bodies import body_sums, find_bodies
+from uem_dolfinx.geometry.rigid import RigidSurface
+from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output.drawings import EVEN
-from uem_dolfinx.output.outside import Outside
+from uem_dolfinx.output.frames import boundary_and_cells, vertex_positions
 from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.loading import rules_of, set_loads
 from uem_dolfinx.solve.problem import UnitedProblem
+
+
+def loads_of(problem: UnitedProblem, wanted: bool = True) -> tuple[Array, Array]:
+    """Nodal forces of the residual's surface integrals on undeformed bodies, and of all its other integrals (collective).
+
+    The latter include stresses, which have no resultant on a body, so that sums over its nodes are resultants of volume loads.
+
+    Args:
+        problem: the problem.
+        wanted: whether to compute them; otherwise zero.
+
+    Returns:
+        Forces at the owned nodes ``(n_owned, gdim)`` each.
+    """
+    config, F = problem.config, problem.bodies.F
+    found = np.zeros((2, config.n_owned, config.gdim))
+    if wanted:
+        over = F.integrals_by_type("exterior_facet")
+        with config.at(np.zeros_like(problem.u.x.array)):
+            for k, part in enumerate((ufl.Form(over) if over else None, F)):
+                if part is not None:
+                    values = forms.assemble_array(problem.u.function_space, forms.form(part))
+                    found[k] = -config.rows(values)[: config.n_owned]
+        found[1] -= found[0]
+    return found[0], found[1]
+
+
+@contextmanager
+def loaded(problem: UnitedProblem, at: float | None) -> Iterator[None]:
+    """A block with loads, Dirichlet values and rigid surfaces set by ``load`` at a load factor or time (collective)."""
+    if at is None:
+        yield
+        return
+    F, load = problem.bodies.F, problem.load
+    terms = [
+        one
+        for one in (*F.constants(), *F.coefficients())
+        if one is not problem.u and isinstance(one, (fem.Constant, fem.Function))
+    ]
+    terms += load if isinstance(load, Mapping) else []
+    terms += [rule.values for rule in rules_of(problem.bodies.bcs)]
+    kept = [(forms.values_of(one), np.array(forms.values_of(one))) for one in terms]
+    targets = [contact.target for contact in problem.contacts if isinstance(contact.target, RigidSurface)]
+    motions = [target.motion for target in targets]
+    now = problem.progress.factor if problem.dynamics is None else problem.dynamics.time
+    try:
+        _set_load(problem, at)
+        yield
+        _set_load(problem, now)
+    finally:
+        for values, before in kept:
+            values[...] = before
+        for target, motion in zip(targets, motions):
+            target.motion = motion
+
+
+def _set_load(problem: UnitedProblem, at: float) -> None:
+    """Set a problem's ``load`` and its couplings at a load factor or time, but not its contacts (collective)."""
+    set_loads(problem.comm, problem.load, at, problem.bodies.bcs)
+    for one in problem.couplings:
+        one.take_load(at)
+
+
+class Outside:
+    """Vertices and exterior facets (the constructor is collective).
+
+    Attributes:
+        X: positions of the d.o.f. of the mesh's P1 space ``(n_local, gdim)``.
+        owned: mask of owned ones ``(n_local,)``.
+        faces: d.o.f. around each owned exterior facet ``(m, k)``.
+        cells: the cells behind them ``(m,)``.
+        normals: outward unit normals at vertices, zero inside ``(n_local, gdim)``.
+    """
+
+    def __init__(self, problem: UnitedProblem):
+        self.config, self.comm = problem.config, problem.comm
+        self.mesh, self.gdim = problem.config.mesh, problem.config.gdim
+        self.X = vertex_positions(problem, 0.0)
+        self.owned: Bools = np.arange(len(self.X)) < compat.function_space(self.mesh, 1).dofmap.index_map.size_local
+        self.faces, self.cells = boundary_and_cells(self.mesh)
+        self.normals = self._outward()
+
+    def gather(self, *arrays: Any) -> list[Any] | None:
+        """Arrays of all ranks, one after the other, on rank 0 (collective)."""
+        parts = self.comm.gather(arrays)
+        return None if parts is None else [np.concatenate(column) for column in zip(*parts)]
+
+    def facets(self, which: Any = slice(None), part: Part | None = None) -> tuple[Array, Array]:
+        """Corners ``(m, k, gdim)`` and outward normals ``(m, gdim)`` of owned exterior facets, some or of a part (collective)."""
+        faces, cells = (self.faces, self.cells) if part is None else boundary_and_cells(self.mesh, part)
+        vectors = _area_vectors(self.X, faces[which], compat.cell_dofs(compat.function_space(self.mesh, 1))[cells[which]])
+        return self.X[faces[which]], vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+    def _outward(self) -> Array:
+        """Outward unit normals at the vertices, zero inside ``(n_local, gdim)`` (collective)."""
+        field = fem.Function(compat.function_space(self.mesh, 1, (self.gdim,)))
+        n = field.x.array.reshape(-1, self.gdim)
+        behind = compat.cell_dofs(compat.function_space(self.mesh, 1))[self.cells]
+        vectors = _area_vectors(self.X, self.faces, behind)
+        for k in range(self.faces.shape[1]):
+            np.add.at(n, self.faces[:, k], vectors)
+        forms.sum_ghosts(field)
+        length = np.linalg.norm(n, axis=1, keepdims=True)
+        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+
+    def at_vertices(self, values: Array) -> Array:
+        """Values at vertices ``(n_local of P1, k)``, from values at nodes ``(n_local, k)`` (collective)."""
+        config, shape = self.config, (values.shape[1],) if values.shape[1] > 1 else ()
+        field = fem.Function(compat.function_space(self.mesh, config.degree, shape))
+        linear = fem.Function(compat.function_space(self.mesh, 1, shape))
+        field.x.array[:] = values.ravel()
+        linear.interpolate(field)
+        linear.x.scatter_forward()
+        return np.array(linear.x.array.reshape(-1, values.shape[1]))
+
+    def touched(self, which: Bools) -> Bools:
+        """Mask of vertices ``(n_local,)`` of owned facets in a mask, including facets of other ranks (collective)."""
+        field = fem.Function(compat.function_space(self.mesh, 1))
+        field.x.array[self.faces[which].ravel()] = 1.0
+        forms.sum_ghosts(field)
+        return np.asarray(field.x.array > 0)
+
+    def body_of_cells(self) -> tuple[Ints, Ints]:
+        """Body of each local cell, and the cell's number in the mesh's input ``(n_cells,)`` (collective)."""
+        label, _ = find_bodies(self.config)
+        first = compat.cell_dofs(self.config.V)[:, 0]
+        return label[first], forms.original_cells(self.mesh)[: len(first)]
+
+
+def _area_vectors(X: Array, faces: Ints, behind: Indices) -> Array:
+    """Outward normals of facets, proportional to their areas ``(m, gdim)``; ``behind`` are vertices of the cells behind them."""
+    corners = X[faces]
+    a = corners[:, 1] - corners[:, 0]
+    n = np.column_stack([a[:, 1], -a[:, 0]]) if X.shape[1] == 2 else np.cross(a, corners[:, 2] - corners[:, 0])
+    inward = X[behind].mean(axis=1) - corners.mean(axis=1)
+    return np.asarray(-np.sign(np.einsum("mg,mg->m", n, inward))[:, None] * n)
 
 
 @dataclass(frozen=True)
@@ -43,7 +186,6 @@ class Actions:
     """Collects present prescribed values, loads and springs.
 
     Args:
-        problem: the problem.
         outside: surface of its bodies.
 
     Attributes:

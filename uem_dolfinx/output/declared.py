@@ -14,11 +14,8 @@ from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.preload import Preload
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
 from uem_dolfinx.geometry.tags import Part, as_tag, name_of
-from uem_dolfinx.output.acting import Acting, Actions
-from uem_dolfinx.output.frames import vertex_cells
-from uem_dolfinx.output.loads import loaded, loads_of
-from uem_dolfinx.output.outside import Outside
-from uem_dolfinx.output.sections import Shape
+from uem_dolfinx.output.acting import Acting, Actions, Outside, loaded, loads_of
+from uem_dolfinx.output.frames import Shape, vertex_cells
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
@@ -92,7 +89,6 @@ class Declarations:
     """Collects the declarations of a problem, in the reference configuration (the constructor is collective).
 
     Args:
-        problem: the problem.
         at: load factor or time of the loads; None for the present loads.
         loads: whether loads that are terms of the residual are included.
 

@@ -19,8 +19,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output import pictures3d
-from uem_dolfinx.output.frames import Frame, Gathering, Pieces
-from uem_dolfinx.output.sections import Shape, grid
+from uem_dolfinx.output.frames import Frame, Gathering, Pieces, Shape, grid
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 

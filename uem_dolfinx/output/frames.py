@@ -1,4 +1,4 @@
-"""Data of drawings, gathered to rank 0: vertices, facets, a field and contact forces."""
+"""Data of drawings, gathered to rank 0: vertices, facets, a field and contact forces; sections through solids, rigid surfaces."""
 
 from __future__ import annotations
 
@@ -17,10 +17,77 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.mesh_sizes import FILLED_BY
+from uem_dolfinx.geometry.rigid import Motion, RigidSurface
 from uem_dolfinx.geometry.tags import Part, as_tag
-from uem_dolfinx.output.sections import Shape, rigid_shapes, sections, solid_cells
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
+
+#: VTK's types of solid cells.
+SOLIDS = {"tetrahedron": 10, "hexahedron": 12}
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A rigid surface where it was when a frame was taken."""
+
+    surface: RigidSurface
+    motion: Motion | None
+
+    def height(self, points: Array) -> Array:
+        """Its function of ``points (n, gdim)``, zero on the surface and negative behind it ``(n,)``."""
+        X = points if self.motion is None else self.motion.back(points)
+        with np.errstate(all="ignore"):
+            return np.asarray(self.surface.distance(X), dtype=float)
+
+
+def rigid_shapes(contacts: Sequence[Contact]) -> list[Shape]:
+    """Rigid targets of contacts, each once, where they are now."""
+    found = {id(c.target): c.target for c in contacts if isinstance(c.target, RigidSurface)}
+    return [Shape(surface, surface.motion) for surface in found.values()]
+
+
+def grid(box: Array, cells: int) -> tuple[list[Array], Array]:
+    """Coordinates along each axis of a box ``(gdim, 2)``, so many cells along its longest side, and all points ``(n, gdim)``, x last."""
+    sides = np.diff(box, axis=1)[:, 0]
+    axes = [np.linspace(ends[0], ends[1], 2 + int(cells * side / sides.max())) for ends, side in zip(box, sides)]
+    all_axes = np.meshgrid(*axes[::-1], indexing="ij")[::-1]
+    return axes, np.column_stack([a.ravel() for a in all_axes])
+
+
+def solid_cells(mesh: Any) -> dict[int, Ints]:
+    """Owned cells by d.o.f. of the P1 space, as VTK numbers their vertices, by their type there ``{type: (n, n_vertices)}``."""
+    cell = compat.cell_name(mesh)
+    dofs = compat.cell_dofs(compat.function_space(mesh, 1))[: mesh.topology.index_map(3).size_local]
+    return {SOLIDS[cell]: compat.vtk_nodes(cell, dofs.astype(np.int64))}
+
+
+def sections(x: Array, values: Array, cells: dict[int, Ints], planes: Sequence[tuple[int, float]]) -> tuple[Array, Array]:
+    """Where planes ``x[axis] = bound`` cut solid cells, by PyVista.
+
+    Args:
+        x: their vertices ``(n, 3)``.
+        values: a field there ``(n,)``.
+        cells: as returned by ``solid_cells``.
+        planes: axis and bound of each.
+
+    Returns:
+        Triangles of the sections ``(k, 3, 3)`` and the field at their corners ``(k, 3)``.
+    """
+    points, found = [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
+    if planes and any(len(some) for some in cells.values()):
+        import pyvista
+
+        solid = pyvista.UnstructuredGrid(cells, x)
+        solid.point_data["field"] = values
+        for axis, bound in planes:
+            normal = np.eye(3)[axis]
+            cut = solid.slice(normal=normal, origin=bound * normal).triangulate()
+            if cut.n_points:
+                corners = cut.faces.reshape(-1, 4)[:, 1:]
+                points.append(np.asarray(cut.points, dtype=float)[corners])
+                found.append(np.asarray(cut.point_data["field"], dtype=float)[corners])
+    return np.concatenate(points), np.concatenate(found)
+
 
 #: Vertices in their order around a facet or a 2D cell, by their number.
 AROUND = {2: [0, 1], 3: [0, 1, 2], 4: [0, 1, 3, 2]}
@@ -64,7 +131,6 @@ class Gathering:
     """Collects frames of a problem (the constructor is collective).
 
     Args:
-        problem: the problem.
         field: for the colours, see ``vertex_values``.
         scale: magnification of the displacement.
         arrows: whether to collect contact forces.

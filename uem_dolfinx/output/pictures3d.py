@@ -15,7 +15,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.errors import InputError, MissingBackendError
-from uem_dolfinx.output.sections import Shape, grid
+from uem_dolfinx.output.frames import Shape, grid
 from uem_dolfinx.parallel import agree
 
 

@@ -18,9 +18,7 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.files import aside, given_path, given_resume, in_use, keep_aside, on_rank_0
 from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.log import logger, timed
-from uem_dolfinx.output.columns import Columns
-from uem_dolfinx.output.pair_tables import PairTables
-from uem_dolfinx.output.tables import Closing, CsvTable, refuse_shared
+from uem_dolfinx.output.tables import Closing, Columns, CsvTable, PairTables, refuse_shared
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
@@ -345,11 +343,7 @@ def refuse_others(step: Any, problem: UnitedProblem) -> None:
 
 
 def _check_fields(fields: Any, mesh: Any) -> None:
-    """Refuse fields that are no UFL expressions by name, on a mesh.
-
-    Raises:
-        InputTypeError, InputError, SpaceError: names the first invalid field.
-    """
+    """InputTypeError, InputError or SpaceError for the first of the fields that is no UFL expression by name, on a mesh."""
     given.kind("fields", fields, fields is None or isinstance(fields, Mapping), "UFL expressions by name, as a dict, or None")
     for name, field in (fields or {}).items():
         given.name("the name of a field", name, "write _ for a blank")

@@ -68,7 +68,6 @@ class XdmfSeries:
 
     Args:
         path: of the XDMF file, in an existing folder.
-        mesh: the mesh.
         nodal: scalar or vector Functions of that Lagrange space, with names.
         cellwise: scalar, vector or tensor DG0 Functions, with names.
         resume_at: keep the steps of existing files up to this number, and append to them; the files are unchanged until the first

@@ -8,7 +8,7 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx.restart.state import State
-from uem_dolfinx.solve.taken import from_checkpoint, to_checkpoint
+from uem_dolfinx.solve.loading import from_checkpoint, to_checkpoint
 
 
 def state_of(problem: Any) -> State:

@@ -108,15 +108,7 @@ def _listed(target: Any) -> TypeGuard[Neighbour]:
 
 
 def _refuse(pair: Interface, by: Array, how: str, moving: bool, places: Array | None = None) -> None:
-    """Raise if a contactor has passed, by a positive length ``(n,)`` (collective).
-
-    Args:
-        pair: the contact.
-        by: the lengths.
-        how: sentence with placeholders for the length and the position.
-        moving: as in ``refuse_passages``.
-        places: positions in the reference configuration ``(n, gdim)`` for the message, or None.
-    """
+    """Raise, with the sentence ``how``, if a contactor has passed by a positive length ``(n,)``, at ``places`` (collective)."""
     error = None
     if (by > 0.0).any():
         i = int(np.argmax(by))

@@ -20,8 +20,8 @@ from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
+from uem_dolfinx.solve.loading import Taken
 from uem_dolfinx.solve.step_control import StepControl
-from uem_dolfinx.solve.taken import Taken
 from uem_dolfinx.solve.united.newton import Iteration
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Progress:
         loads: values of its Constants at its beginning.
         carried: released forces at all unknowns at its beginning, ghosts included ``(n,)``; None if zero.
         of_equations: multipliers of equations of users at their eliminated components, from a checkpoint ``(n_local, gdim)``.
-        taken: shares of the committed state, see ``solve.taken``.
+        taken: shares of the committed state, see ``solve.loading``.
         began: shares at the beginning of the call.
         left: load factors at which lists of several ``Step`` were left before their end, by the number of the call that the ``Step``
             counts as.

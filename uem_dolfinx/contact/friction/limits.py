@@ -25,7 +25,6 @@ class Limits:
         duration: length of the present step, a time; None in statics.
 
     Attributes:
-        law: friction law.
         value: parameter of the law at the contactors ``(n,)``.
         area: area of ``lam`` as an integral of the pressure ``(n,)``; zeros unless the law needs it.
         speed: slip speed in the present step ``(n,)``; zeros unless the law needs it.

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
-from uem_dolfinx.contact.friction import rubbing, stick_slip
-from uem_dolfinx.contact.friction.anchors import anchored, anchors_of, way_since
-from uem_dolfinx.contact.friction.frame import Frame
+from uem_dolfinx.contact.friction import stick_slip
+from uem_dolfinx.contact.friction.frame import Frame, anchored, anchors_of, force_times_way, way_since
 from uem_dolfinx.contact.friction.limits import Limits
-from uem_dolfinx.contact.friction.pivot import LastStep, Pivot
 from uem_dolfinx.contact.friction.rows import with_friction
+from uem_dolfinx.contact.friction.stick_slip import LastStep, Pivot
 from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING, Violations
 from uem_dolfinx.contact.seam.corners import friction_in
@@ -35,10 +34,8 @@ class Sliding:
     """Friction of the contactors of one interface.
 
     Args:
-        config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         discretisation: relates them to their target.
-        law: friction law.
         value: parameter of the law at the contactors ``(n,)``.
         limits: limits of the friction forces.
         keeps_feet: whether closest points are constant during the step.
@@ -415,9 +412,7 @@ class Sliding:
         self, state: PairState, committed: PairState, kinematics: Kinematics, tau: Array, ways: tuple[Array, Array]
     ) -> Array:
         assert self.wear is not None
-        return _of(committed).worn + self.wear.depths(
-            *rubbing.force_times_way(self.frame, kinematics, (committed, state), tau, ways)
-        )
+        return _of(committed).worn + self.wear.depths(*force_times_way(self.frame, kinematics, (committed, state), tau, ways))
 
     def forget(self) -> None:
         """Discard the reference of slip."""

@@ -1,4 +1,4 @@
-"""Wear of contactors: depth removed by slip under pressure in a step, which increases gaps."""
+"""Wear of contactors by Archard's law: depth removed by slip under pressure in a step, which increases gaps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices
-from uem_dolfinx.contact.laws.archard import worn_volume
 from uem_dolfinx.contact.laws.law import Field, asked_at
 from uem_dolfinx.contact.mortar.duals import basis_of
 from uem_dolfinx.contact.seam.state import PairState
@@ -34,7 +33,6 @@ class Wear:
     integrals with the basis of the forces: shape functions, or the Bernstein basis at degree 2.
 
     Args:
-        config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         k: coefficient of wear over hardness.
         tag: the contactor.
@@ -116,3 +114,14 @@ class Wear:
                 self._name,
                 count,
             )
+
+
+def worn_volume(k: Array, start: Array, end: Array) -> Array:
+    """Worn volume of a step ``(n,)``: k times the mean of normal force times slip, with the forces at the start and at the end.
+
+    Args:
+        k: wear coefficient over hardness, one over a pressure ``(n,)``.
+        start: normal force at the start of the step times the slip, an energy; tension causes no wear ``(n,)``.
+        end: normal force at the end times the slip ``(n,)``.
+    """
+    return np.asarray(0.5 * k * (np.maximum(start, 0.0) + np.maximum(end, 0.0)))

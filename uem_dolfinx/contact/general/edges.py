@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.arrays import Bools, Ints
-from uem_dolfinx.contact.further.edges import LISTS, OfCrossings
+from uem_dolfinx.contact.further.part import LISTS, OfCrossings
 from uem_dolfinx.contact.general.parts import BodiesContact
 from uem_dolfinx.geometry.edge_crossings import Crossings, SharpLines
 from uem_dolfinx.parallel import reduced

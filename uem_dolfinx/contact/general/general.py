@@ -93,7 +93,7 @@ class GeneralContact(OfProblem, given.Sealed):
         edges: bool | None = None,
         **others: Any,
     ):
-        from uem_dolfinx.contact.general.given_laws import given_edges, refuse_words_of_contact
+        from uem_dolfinx.contact.general.pair_friction import given_edges, refuse_words_of_contact
 
         with agreed((None if surfaces is None else communicator_of(surfaces)) or MPI.COMM_SELF):
             refuse_words_of_contact(others)
@@ -174,7 +174,7 @@ class GeneralContact(OfProblem, given.Sealed):
                 f"{self.name}: there is one body and no rigid surface: give rigid=..., or self_contact=True for a body that touches "
                 "itself"
             )
-        from uem_dolfinx.contact.general.given_laws import refuse_distant_pressures, refuse_open_conductance
+        from uem_dolfinx.contact.general.pair_friction import refuse_distant_pressures, refuse_open_conductance
 
         refuse_open_conductance(config, self.name, self.heats, bound)
         refuse_distant_pressures(config, self.name, self.normal, skin)
@@ -225,8 +225,8 @@ class GeneralContact(OfProblem, given.Sealed):
         """Mortar contacts with each target body (collective); arguments as for ``_nodes``."""
         from uem_dolfinx.contact.general.edges import crossings_of, edge_contacts
         from uem_dolfinx.contact.general.mortar import Body
-        from uem_dolfinx.geometry.faces import classes_of_facets, facets_by_class, surface_of
         from uem_dolfinx.geometry.neighbours import Neighbours
+        from uem_dolfinx.geometry.skin import classes_of_facets, facets_by_class, surface_of
 
         skin, found, order = self._skin, list[Contact](), np.argsort(place)
         # which bodies may touch; nodes are searched by each body

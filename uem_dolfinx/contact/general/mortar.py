@@ -1,6 +1,6 @@
 """Mortar between the surfaces of many bodies: each body is a separate target for the facets of all bodies that follow it.
 
-A mortar equation has one direction: facets that meet at a sharp edge belong to different contacts, see ``geometry.faces``.
+A mortar equation has one direction: facets that meet at a sharp edge belong to different contacts, see ``geometry.skin``.
 """
 
 from __future__ import annotations

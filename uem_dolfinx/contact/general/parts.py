@@ -162,11 +162,7 @@ class AmongContact(BodiesContact):
         return Meeting(self._skin, self._skin, self._neighbours.apart, self._neighbours.itself)
 
     def _received(self) -> Array:
-        """Forces on active contactors by nodes of the touched body that follow them, if one of the two is at a sharp edge.
-
-        Returns:
-            ``(n, gdim)`` (collective).
-        """
+        """Forces ``(n, gdim)`` by nodes of the touched body that follow active contactors, where one is at a sharp edge (collective)."""
         skin, config, told = self._skin, self.config, []
         for pair in (one.pair for one in self._together if one.pair.asked):
             row, node, weight = pair.kinematics.means()[1]

@@ -7,6 +7,10 @@ the traction is ``K w+``, then it softens, ``(1 - D) K w+`` with a damage D that
 
 as in Turon, Camanho, Costa, Davila, Mechanics of Materials 38 (2006) 1072-1089. Derivatives of D are taken with a complex step, exact
 to rounding. Unloading returns to the origin, or, plastic, with the stiffness K to a permanent opening.
+
+Mixed modes of fracture: how much energy and strength a cohesive surface has between opening and shear.
+
+The share B of the shear is 0 in pure opening, 1 in pure shear.
 """
 
 from __future__ import annotations
@@ -17,10 +21,110 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.laws.bilinear import Bilinear
-from uem_dolfinx.contact.laws.exponential_softening import ExponentialSoftening
-from uem_dolfinx.contact.laws.mixed_mode import MixedMode
 from uem_dolfinx.errors import InputError
+
+
+class MixedMode(Protocol):
+    """A value between that of pure opening and that of pure shear."""
+
+    def between(self, opening: float, shear: float, share: Any) -> Any:
+        """The energy per area, or half the square of the strength over the stiffness, at shares of shear ``(n,)``, which may be complex.
+
+        Args:
+            opening: value in pure opening.
+            shear: value in pure shear.
+            share: part of the shear in the square of the opening ``(n,)``.
+        """
+
+
+class BenzeggaghKenane(given.Sealed):
+    """``G = G_1 + (G_2 - G_1) B^eta`` [Benzeggagh, Kenane, Composites Science and Technology 56 (1996) 439-449].
+
+    Args:
+        eta: exponent, 1 or more; 1.5 to 3 for layered composites.
+
+    Raises:
+        InputError, InputTypeError: for an exponent below 1.
+    """
+
+    def __init__(self, eta: float):
+        self.eta = given.number("eta", eta, AT_LEAST_ONE)
+
+    def __repr__(self) -> str:
+        """With its exponent."""
+        return f"BenzeggaghKenane({self.eta:g})"
+
+    def between(self, opening: float, shear: float, share: Any) -> Any:
+        """See ``MixedMode``."""
+        return opening + (shear - opening) * share**self.eta
+
+
+class Power(given.Sealed):
+    """``(G_I / G_1)^a + (G_II / G_2)^a = 1`` for the parts G_I = (1 - B) G and G_II = B G.
+
+    Args:
+        a: exponent, 1 or more.
+
+    Raises:
+        InputError, InputTypeError: for an exponent below 1.
+    """
+
+    def __init__(self, a: float):
+        self.a = given.number("a", a, AT_LEAST_ONE)
+
+    def __repr__(self) -> str:
+        """With its exponent."""
+        return f"Power({self.a:g})"
+
+    def between(self, opening: float, shear: float, share: Any) -> Any:
+        """See ``MixedMode``."""
+        return (((1.0 - share) / opening) ** self.a + (share / shear) ** self.a) ** (-1.0 / self.a)
+
+
+AT_LEAST_ONE = given.Range("a number of 1 or more", lambda x: x >= 1)
+
+
+#: The strength that is left under plastic unloading is found by so many of Newton's steps, which converge monotonically.
+#: [bound; iterations; -]
+ITERATIONS = 30
+
+
+class ExponentialSoftening:
+    """``t = strength exp(-(w - w_0) / l)`` from the onset w_0 on, with ``l = energy / strength - w_0 / 2``.
+
+    In plastic openings it is ``strength exp(-w_p strength / energy)``.
+    """
+
+    def softening(self, w: Any, strength: Any, energy: Any, stiffness: float) -> Any:
+        """See ``Softening``."""
+        onset = strength / stiffness
+        return strength * np.exp(-(w - onset) / (energy / strength - 0.5 * onset))
+
+    def left(self, trial: Any, strength: Any, energy: Any, stiffness: float, before: Any) -> Any:
+        """See ``Softening``."""
+        a, begin = stiffness * energy / strength, np.log(np.maximum(before.real, np.finfo(float).tiny))
+        z = begin + 0.0 * trial
+        for _ in range(ITERATIONS):
+            e = strength * np.exp(z)
+            z = z - (e - a * (z - begin) - trial) / (e - a)
+        return np.exp(z)
+
+
+class Bilinear:
+    """``t = strength (w_f - w) / (w_f - w_0)`` from the onset w_0 to the largest opening ``w_f = 2 energy / strength``."""
+
+    def softening(self, w: Any, strength: Any, energy: Any, stiffness: float) -> Any:
+        """See ``Softening``."""
+        last = 2.0 * energy / strength
+        t = strength * (last - w) / (last - strength / stiffness)
+        return np.where(w.real < last.real, t, 0.0)
+
+    def left(self, trial: Any, strength: Any, energy: Any, stiffness: float, before: Any) -> Any:
+        """See ``Softening``."""
+        slope = 2.0 * stiffness * energy / strength
+        q = (slope * before - trial) / (slope - strength)
+        return np.where(q.real > 0.0, q, 0.0)
+
 
 #: Stiffness before damage, without one given: so many times the least at which the law can soften, strength^2 / (2 energy).
 #: [convention; the least stiffness; test_cohesive_laws.py::test_the_stiffness_before_damage]

@@ -62,7 +62,7 @@ class Conductance(given.Sealed):
         joule: int | None = None,
         joule_share: float = 0.5,
     ):
-        from uem_dolfinx.contact.laws.constants import checked
+        from uem_dolfinx.contact.laws.soft import checked
 
         self.h = h if given.function(h) else given.number("h", h, CONDUCTANCE)
         self.field = given.part_number("field", field, "the temperature")

@@ -1,4 +1,4 @@
-"""Coulomb's law: friction up to a coefficient times the normal force, and up to a given stress or force."""
+"""Friction up to a coefficient times the normal force (Coulomb), or up to a stress that does not depend on the pressure (Tresca)."""
 
 from __future__ import annotations
 
@@ -57,3 +57,22 @@ class Coulomb:
         most = np.full_like(lam, self.force) if self.most is None else self.most * area
         below = value * lam < most
         return np.where(below, value * lam, most), np.where(below, value, 0.0)
+
+
+@dataclass(frozen=True)
+class Tresca:
+    """A contactor in contact slips if the tangential force reaches ``tau A``.
+
+    The matrix of the constrained system is symmetric, since test rows are the rows of P.
+
+    Args:
+        field: the stress tau, a force per reference area: a number, or a function of reference positions ``(3, n)`` that returns
+            ``(n,)``.
+    """
+
+    field: float | Callable[[Array], npt.ArrayLike]
+    per_area = True
+
+    def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
+        """``tau A`` and 0; see ``FrictionLaw``."""
+        return value * area, np.zeros_like(value)

@@ -1,14 +1,14 @@
-"""Soft contact: the contact pressure is a function of the gap, p(g), as on rough surfaces.
+"""Soft contact: the contact pressure is a function of the gap, p(g), as on rough surfaces, or under adhesion.
 
-A law is a class with ``rest`` and ``pressure(gap)``. ``linear``, ``exponential``, ``power_law`` and ``pressure_table`` are examples, one
-file each; a user's own law is passed to ``SoftContact`` in the same way.
+A law is a class with ``rest`` and ``pressure(gap)``: ``Linear``, ``Exponential``, ``PowerLaw`` and ``PressureTable`` are examples. A
+user's own law is passed to ``SoftContact`` in the same way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, ClassVar, Protocol, TypeAlias
 
 from mpi4py import MPI
 
@@ -18,10 +18,27 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.laws.constants import checked
-from uem_dolfinx.contact.laws.linear import Linear
-from uem_dolfinx.errors import InputError
+from uem_dolfinx.errors import InputError, InputTypeError
 from uem_dolfinx.parallel import agreed, ask_together
+
+
+def value(number: float | fem.Constant) -> float:
+    """The present value of a number or a Constant."""
+    return float(number.value) if isinstance(number, fem.Constant) else number
+
+
+def checked(what: str, number: Any, within: given.Range) -> float | fem.Constant:
+    """A number or a Constant whose present value is in a range; raises as ``given.number`` does."""
+    if isinstance(number, fem.Constant):
+        given.number(what, number.value, within)
+        return number
+    return given.number(what, number, within)
+
+
+def described(law: object) -> str:
+    """A law with its arguments, the same in every run: Constants without their values."""
+    return f"{type(law).__name__}({', '.join(f'{name}={given.described(one)}' for name, one in vars(law).items())})"
+
 
 #: The pressure of a function is differentiated over so much of the gap, and of a law over so much of the value of a Constant.
 #: [derived; the gap or the value; test_soft_laws.py::test_slopes_by_differences]
@@ -95,8 +112,6 @@ class SoftContact(given.Sealed):
         elif function is not None:
             self.law = _OfFunction(function, slope)
         elif isinstance(p, Sequence | np.ndarray) and not isinstance(p, str):
-            from uem_dolfinx.contact.laws.pressure_table import PressureTable
-
             self.law = PressureTable.of(p)
         else:
             self.law = Linear(checked("p", p, given.POSITIVE))
@@ -150,3 +165,176 @@ class SoftContact(given.Sealed):
         finally:
             m.value = before
         return np.asarray((sides[0] - sides[1]) / (2.0 * step))
+
+
+@dataclass(frozen=True, repr=False)
+class Linear:
+    """``p = -k g`` for g <= 0, else 0.
+
+    Args:
+        k: stiffness per area, a pressure over a length, a number or a Constant.
+    """
+
+    k: float | fem.Constant
+    rest = 0.0
+    __repr__ = described
+
+    def pressure(self, gap: Array) -> tuple[Array, Array]:
+        """See ``PressureLaw``."""
+        k = value(self.k)
+        return k * np.maximum(-gap, 0.0), np.where(gap <= 0.0, -k, 0.0)
+
+
+@dataclass(frozen=True, repr=False)
+class Exponential:
+    """``p = p0 exp(-g / h)``, the closure of rough surfaces with exponentially distributed heights.
+
+    Greenwood, Williamson, Proceedings of the Royal Society A 295 (1966) 300-319. Beyond ``REACH`` times h the pressure is zero.
+
+    Args:
+        p0: pressure at gap 0, a number or a Constant.
+        h: length over which the pressure changes by a factor e, a number or a Constant.
+
+    Raises:
+        InputError, InputTypeError: for numbers that are not positive.
+    """
+
+    p0: float | fem.Constant
+    h: float | fem.Constant
+    rest = 0.0
+    __repr__ = described
+    #: Gap, over h, beyond which the pressure is rounding of p0; and overlap, over h, beyond which it grows linearly: below overflow.
+    #: [derived; h; test_soft_laws.py::test_an_exponential_law_far_out]
+    REACH: ClassVar[float] = float(-np.log(np.finfo(float).eps))
+
+    def __post_init__(self) -> None:
+        for name in ("p0", "h"):
+            object.__setattr__(self, name, checked(name, getattr(self, name), given.POSITIVE))
+
+    def pressure(self, gap: Array) -> tuple[Array, Array]:
+        """See ``PressureLaw``."""
+        p0, h = value(self.p0), value(self.h)
+        x = gap / h
+        e = p0 * np.exp(-np.maximum(x, -self.REACH)) * (x < self.REACH)
+        return e * (1.0 + np.maximum(-self.REACH - x, 0.0)), -e / h
+
+
+#: Bodies that nothing else holds are put onto a surface of a power law with this overlap, over h: at gap 0 it has no stiffness.
+#: [convention; h; test_soft_contact.py::test_a_block_that_rests_on_a_power_law]
+SUNK = 1e-2
+EXPONENT = given.Range("a number of at least 1", lambda m: (m >= 1) & np.isfinite(m))
+
+
+@dataclass(frozen=True, repr=False)
+class PowerLaw:
+    """``p = p0 (-g / h)^m`` for g < 0, else 0, the closure of rough surfaces.
+
+    Greenwood, Williamson, Proceedings of the Royal Society A 295 (1966) 300-319, with the power law of Back, Burdekin, Cowley (1973)
+    for machined joints. An ``offset`` of the contact is the height at which asperities touch first.
+
+    Args:
+        p0: pressure at an overlap h.
+        h: an overlap, a positive length.
+        m: exponent, at least 1. All three are numbers or Constants.
+
+    Raises:
+        InputError, InputTypeError: for numbers out of their range.
+    """
+
+    p0: float | fem.Constant
+    h: float | fem.Constant
+    m: float | fem.Constant
+    __repr__ = described
+
+    def __post_init__(self) -> None:
+        for name, within in (("p0", given.POSITIVE), ("h", given.POSITIVE), ("m", EXPONENT)):
+            object.__setattr__(self, name, checked(name, getattr(self, name), within))
+
+    @property
+    def rest(self) -> float:
+        """See ``PressureLaw``."""
+        return -SUNK * value(self.h)
+
+    def pressure(self, gap: Array) -> tuple[Array, Array]:
+        """See ``PressureLaw``."""
+        p0, h, m = value(self.p0), value(self.h), value(self.m)
+        x = np.maximum(-gap / h, 0.0)
+        return p0 * x**m, np.where(gap <= 0.0, -p0 * m / h * x ** (m - 1.0), 0.0)
+
+
+@dataclass(frozen=True)
+class PressureTable:
+    """Pressures between the points of a table are linear; below its first gap they continue with its first slope, above its last one 0.
+
+    Attributes:
+        gaps: ascending.
+        values: pressures, not increasing, the last one 0.
+    """
+
+    gaps: tuple[float, ...]
+    values: tuple[float, ...]
+
+    @classmethod
+    def of(cls, table: Any) -> PressureTable:
+        """The table of pairs ``(gap, pressure)``.
+
+        Raises:
+            InputTypeError: if it consists of no pairs of numbers.
+            InputError: for gaps that do not ascend, or pressures that increase, are negative, or are not 0 at the last gap.
+        """
+        words = "two or more pairs (gap, pressure), gaps in ascending order, pressures that do not increase and end with 0"
+        try:
+            a = given.numbers(table)
+        except (TypeError, ValueError):
+            raise InputTypeError(given.sentence("p", table, words)) from None
+        fits = a.ndim == 2 and a.shape[1:] == (2,) and len(a) > 1 and bool(np.isfinite(a).all())
+        if not fits or not (np.diff(a[:, 0]) > 0).all() or (np.diff(a[:, 1]) > 0).any() or a[-1, 1] != 0.0 or a[0, 1] <= 0.0:
+            raise InputError(given.sentence("p", table, words))
+        return cls(*map(tuple, a.T.tolist()))
+
+    @property
+    def rest(self) -> float:
+        """See ``PressureLaw``."""
+        return self.gaps[self.values.index(0.0)]
+
+    def pressure(self, gap: Array) -> tuple[Array, Array]:
+        """See ``PressureLaw``."""
+        g, p = np.array(self.gaps), np.array(self.values)
+        # a point belongs to the piece before it
+        i = np.maximum(np.searchsorted(g, gap) - 1, 0)
+        slopes = np.append(np.diff(p) / np.diff(g), 0.0)
+        return p[i] + slopes[i] * (gap - g[i]), slopes[i]
+
+
+class Adhesion(given.Sealed):
+    """Attraction of surfaces by their gap, ``strength (1 - g / range)`` up to the ``range = 2 energy / strength``.
+
+    Where surfaces touch, contact is hard; they separate at the strength, and adhere again when they touch. A large strength is the
+    limit of Johnson, Kendall and Roberts (JKR), in which a sphere of radius R is pulled off by ``1.5 pi energy R``.
+
+    Args:
+        energy: of adhesion, an energy per area.
+        strength: largest attraction, a force per area. The zone of attraction around a contact is of the length
+            ``energy E* / strength^2``, which cells must resolve.
+
+    Raises:
+        InputError, InputTypeError: for numbers that are not positive.
+    """
+
+    #: Whether surfaces are bonded point to point.
+    bonds = False
+
+    def __init__(self, energy: float, strength: float):
+        self.energy = given.number("energy", energy, given.POSITIVE)
+        self.strength = given.number("strength", strength, given.POSITIVE)
+
+    def __repr__(self) -> str:
+        """With its numbers."""
+        return f"Adhesion({self.energy:g}, {self.strength:g})"
+
+    def attraction(self, gap: Array) -> tuple[Array, Array]:
+        """Attractions, and their derivatives by the gap, at gaps ``(n,)``; constant below zero, where contact closes the gap."""
+        reach = 2.0 * self.energy / self.strength
+        within = (gap > 0.0) & (gap < reach)
+        t = self.strength * np.clip(1.0 - gap / reach, 0.0, 1.0)
+        return t, np.where(within, -self.strength / reach, 0.0)

@@ -1,4 +1,4 @@
-"""Friction that depends on the slip speed, with static and kinetic coefficients and a transition between them."""
+"""Friction that depends on the slip speed (Stribeck, viscous films) or falls with the pressure (Thirion)."""
 
 from __future__ import annotations
 
@@ -63,3 +63,72 @@ class Stribeck:
             slope = slope - above / self.velocity
         mu = self.kinetic + above + self.viscous * speed
         return mu * lam, mu, slope * lam
+
+
+@dataclass(frozen=True, init=False)
+class Thirion:
+    """A contactor slips if the tangential force reaches ``mu(p) lam``, with ``1 / mu(p) = 1 / mu + p / stress`` at the pressure p.
+
+    Coulomb's law at low pressures, and Tresca's at high ones: the friction stress tends to ``stress``, as the true area of contact does
+    to the apparent one. Thirion, Les coefficients d'adherence du caoutchouc, Revue generale du caoutchouc 23 (1946) 101-106.
+
+    Args:
+        field: the coefficient mu at low pressure, a number, or a function as for ``Contact``.
+        stress: the friction stress at high pressure, a force per reference area.
+
+    Raises:
+        InputError, InputTypeError: if ``stress`` is not a positive number.
+    """
+
+    field: float | Callable[..., npt.ArrayLike]
+    stress: float
+    per_area = True
+
+    def __init__(self, field: float | Callable[..., npt.ArrayLike], stress: float):
+        object.__setattr__(self, "field", field)
+        object.__setattr__(self, "stress", given.number("stress", stress, given.POSITIVE))
+
+    def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
+        """``mu(p) lam`` and its derivative; see ``FrictionLaw``."""
+        most = self.stress * area
+        share = np.where(area > 0.0, most / np.where(area > 0.0, most + value * lam, 1.0), 0.0)
+        return share * value * lam, share**2 * value
+
+
+@dataclass(frozen=True, init=False)
+class ViscousFriction:
+    """Where surfaces touch, slip with the speed v is opposed by the traction ``eta v``, per reference area; nothing sticks.
+
+        tau = min(eta v, mu p)
+
+    The speed is that of the present time step, the slip over its length: the law is implicit, with a consistent tangent, and of first
+    order in the step.
+
+    Args:
+        field: eta, the viscosity of a film over its thickness: a stress per speed, a number or a function as for ``Contact``.
+        mu: coefficient of the largest traction, by the contact pressure p; infinite for none.
+
+    Raises:
+        InputError, InputTypeError: if a number is negative.
+    """
+
+    field: float | Callable[..., npt.ArrayLike]
+    mu: float
+    per_area = True
+    timed = True
+
+    def __init__(self, eta: float | Callable[..., npt.ArrayLike], *, mu: float = np.inf):
+        object.__setattr__(self, "field", eta if given.function(eta) else given.number("eta", eta, given.NOT_NEGATIVE))
+        object.__setattr__(self, "mu", given.number("mu", mu, given.POSITIVE_OR_INFINITE))
+
+    def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
+        """Zero; see ``FrictionLaw``."""
+        return 0.0 * lam, 0.0 * lam
+
+    def sliding(self, value: Array, lam: Array, area: Array, speed: Array) -> tuple[Array, Array, Array]:
+        """``min(eta A v, mu lam)`` and its derivatives; see ``RateLaw``."""
+        viscous, rate, none = value * area * speed, value * area, np.zeros_like(lam)
+        if np.isinf(self.mu):
+            return viscous, none, rate
+        full = viscous > self.mu * lam
+        return np.where(full, self.mu * lam, viscous), np.where(full, self.mu, none), np.where(full, none, rate)

@@ -117,14 +117,7 @@ class Mortar(Contactors):
         return can
 
     def _follow(self, rows: WeightedRows, then: Array, gap: Array, before: Motion | None) -> WeightedRows:
-        """The kept rows in the current configuration: gaps change along them (collective).
-
-        Args:
-            rows: kept.
-            then: positions of the owned nodes at that time ``(n_owned, gdim)``.
-            gap: of the plain rows at that time, without offsets ``(n,)``.
-            before: motion of a rigid target at that time.
-        """
+        """The kept rows in the current configuration: ``gap (n,)``, at the positions ``then``, changes along them (collective)."""
         now = self.target.motion
         if now is not before:
             still = Motion.none(self.config.gdim)

@@ -83,14 +83,7 @@ def _at_ends(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
 
 @dataclass(frozen=True)
 class _Ends:
-    """Ends of the target over contactor facets with pressure.
-
-    Attributes:
-        at: points of the segments.
-        other: shape of the target's facets.
-        pressure: multipliers of the contactor facets' nodes ``(m, nc)``.
-        which: pairs, with all opposite facets of each contactor facet ``(p,)``.
-    """
+    """Ends of the target over contactor facets with ``pressure (m, nc)``; ``which`` are pairs with all opposite facets of each."""
 
     at: SegmentPoints
     other: FacetShape

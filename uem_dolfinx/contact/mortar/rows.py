@@ -1,4 +1,7 @@
-"""Rows of weighted gaps as lists of terms, on the ranks that own their nodes."""
+"""Rows of weighted gaps as lists of terms, on the ranks that own their nodes.
+
+Contactors that equations of users give one displacement have one row: one basis function lies on both sides of a seam.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,132 @@ import numpy as np
 
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_groups
-from uem_dolfinx.conditions.seams import Seams
-from uem_dolfinx.contact.mortar.seam import Seam
+from uem_dolfinx.conditions.seams import Seams, groups_of
+from uem_dolfinx.contact.mortar.duals import basis_of
 from uem_dolfinx.contact.mortar.tangent import SegmentPoints
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.facets import TargetFacets
+from uem_dolfinx.geometry.facets import TargetFacets, facets_of
+from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.geometry.overlaps import Segments
-from uem_dolfinx.parallel import Exchange
+from uem_dolfinx.geometry.tags import Tag
+from uem_dolfinx.parallel import Exchange, reduced
+
+
+class Seam:
+    """Contactors of one contact with one displacement: each has the row of the facets around all of them, and a part of its force.
+
+    Args:
+        space: nodes of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        seams: equations that make seams, or None.
+
+    Attributes:
+        sharing: number of contactors with the row of each ``(n,)``.
+    """
+
+    def __init__(self, space: Nodes, nodes: Indices, seams: Seams | None):
+        node, group = (np.zeros(0, np.int64),) * 2 if seams is None else seams.groups(space, nodes)
+        own = np.isin(node, space.to_global(nodes))
+        kept = reduced(space.comm, own) > 0 if seams is not None else own
+        kept[kept] = (np.bincount(group[kept]) > 1)[group[kept]]
+        self._comm, self._n_owned, self._node = space.comm, space.n_owned, node[kept]
+        _, self._group = np.unique(group[kept], return_inverse=True)
+        #: Whether there are any.
+        self.any = bool(kept.any())
+        size = np.bincount(self._group)
+        order = np.argsort(self._group, kind="stable")
+        #: Contactors of each group, -1 for none.
+        self._members = np.full((len(size), int(size.max(initial=0))), -1, dtype=np.int64)
+        self._members[self._group[order], np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)] = self._node[order]
+        local = groups_of(space.to_global(np.arange(space.n_local)), self._node, self._group)
+        self._local = np.flatnonzero(local >= 0)
+        self._of_local = local[self._local]
+        self._owned = int(np.searchsorted(self._local, space.n_owned))
+        sharing = np.ones(space.n_owned)
+        sharing[self._local[: self._owned]] = size[self._of_local[: self._owned]]
+        self.sharing: Array = sharing[nodes]
+
+    def sums(self, values: Array) -> Array:
+        """Values at owned or local nodes ``(n_owned, ...)`` or ``(n_local, ...)``, with the sum of each group at all of it (collective)."""
+        if not self.any:
+            return values
+        sums = np.zeros((len(self._members), *values.shape[1:]))
+        np.add.at(sums, self._of_local[: self._owned], values[self._local[: self._owned]])
+        sums, some, out = reduced(self._comm, sums), self._local < len(values), values.copy()
+        out[self._local[some]] = sums[self._of_local[some]]
+        return out
+
+    def evenly(self, nodes: Indices, values: Array) -> Array:
+        """Values of owned contactors ``(n,)``, with the mean of each group at all of it (collective)."""
+        nodal = np.zeros(self._n_owned)
+        nodal[nodes] = values
+        return np.asarray(self.sums(nodal)[nodes] / self.sharing)
+
+    def apart(self, nodes: Indices, own: Array, values: Array) -> Array:
+        """Terms ``own . v`` of all of a group, less those of its sum times the contactor's own values: 0 for equal ones (collective).
+
+        Args:
+            nodes: owned contactors ``(n,)``.
+            own: each contactor's part of the coefficients of its group ``(n, k)``.
+            values: of the owned nodes ``(n_owned, k)``.
+
+        Returns:
+            Component by component ``(n, k)``.
+        """
+        parts = np.zeros((len(values), 2 * own.shape[1]))
+        parts[nodes] = np.concatenate([own, own * values[nodes]], axis=1)
+        coefficients, terms = np.split(self.sums(parts)[nodes], 2, axis=1)
+        return np.asarray(terms - coefficients * values[nodes])
+
+    def same(self, nodes: Ints) -> Bools:
+        """Whether two global nodes of a facet ``(m, nn)`` are one contactor, or of one group ``(m, nn, nn)``."""
+        group = groups_of(nodes, self._node, self._group)
+        number = np.where(group < 0, nodes, -1 - group)
+        return np.asarray(number[:, :, None] == number[:, None])
+
+    def rows(self, row: Ints, term: Ints, value: Array) -> tuple[Ints, Ints, Array]:
+        """Terms of the rows of global nodes, those of a group for each of it; its rows follow none of it but their own node."""
+        if not self.any:
+            return row, term, value
+        of_row, of_term = (groups_of(nodes, self._node, self._group) for nodes in (row, term))
+        one, many = np.flatnonzero(of_row < 0), np.flatnonzero(of_row >= 0)
+        i, j = np.nonzero(self._members[of_row[many]] >= 0)
+        many = many[i]
+        to = self._members[of_row[many], j]
+        terms = np.where(of_term[many] == of_row[many], to, term[many])
+        return np.concatenate([row[one], to]), np.concatenate([term[one], terms]), np.concatenate([value[one], value[many]])
+
+
+def density(config: Configuration, tag: Tag, nodes: Indices, amounts: Array, areas: Array) -> Array:
+    """Values at the owned nodes ``(n_owned,)`` of a field of shape functions whose integral is the sum of the amounts (collective).
+
+    Of degree 2 it is the combination of Bernstein's functions, which are nowhere negative, each with its amount over its integral.
+
+    Args:
+        config: configuration of the displacement.
+        tag: facets of the contactor.
+        nodes: owned contactor nodes ``(n,)``.
+        amounts: at these ``(n,)``, which belong to shape functions, at degree 2 to Bernstein's functions.
+        areas: integrals of these functions ``(n,)``.
+    """
+    whole, own = np.zeros((2, config.n_owned))
+    whole[nodes], own[nodes] = amounts, areas
+    if config.degree == 1:
+        return _over(whole, own)
+    surface, every = facets_of(config, tag, "contactor"), np.arange(config.n_owned)
+    dofs, to_nodes = surface.dofs.ravel(), np.linalg.inv(basis_of(surface.shape).T)
+    coefficients = config.from_owners(every, _over(whole, own)[:, None], dofs).reshape(surface.dofs.shape)
+    values, count = (
+        config.to_owners(dofs, part.ravel())[: config.n_owned]
+        for part in (coefficients @ to_nodes.T, np.ones(surface.dofs.shape))
+    )
+    return _over(values, count)
+
+
+def _over(values: Array, by: Array) -> Array:
+    """Quotients, zero where there is nothing to divide by."""
+    return np.where(by > 0, values / np.where(by > 0, by, 1.0), 0.0)
+
 
 #: Facets around a node that are told apart by the bits of one number; further ones are told apart at their other nodes.
 #: [bound; bits; -]
@@ -108,7 +230,6 @@ class Elimination:
     """Assembly of the rows of one surface on the ranks that own the nodes.
 
     Args:
-        config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         seams: equations that give nodes one displacement, or None.
 
@@ -186,7 +307,6 @@ class Remembered:
     """Bits of contactors, one for each facet around them, independent of the partition (collective).
 
     Args:
-        config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         surface: the contactor's facets.
     """

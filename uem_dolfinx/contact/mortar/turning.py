@@ -104,15 +104,7 @@ def _at_ends(at: SegmentPoints, other: FacetShape, traction: Array) -> list[tupl
 
 
 def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: Ints) -> Array:
-    """What ``handing_on`` has from parts of facets that do not grow as these do.
-
-    Args:
-        at: points of the segments.
-        traction: as for ``handing_on``.
-        which: pairs ``(p,)``.
-        q: their points.
-        pair: of these, among them.
-    """
+    """What ``handing_on`` has from parts of facets that do not grow as these do, at points ``q`` of the pairs ``which``."""
     e, k, (m, nc, g), nt = at.facet[which], len(which), traction.shape, at.opposite.shape[1]
     weight, grown = at.segments.weight[q], at.stretching[q].reshape(len(q), nc * g)
     of_share, of_mean = at.duals.spread(e[pair], at.b[q], traction)

@@ -18,14 +18,18 @@ import numpy as np
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
-from uem_dolfinx.contact.seam.ends import Ends, slide_off
+from uem_dolfinx.contact.seam.ends import END_HOLDS, Ends, slide_off
 from uem_dolfinx.contact.seam.placement import Along, ContactRows, GapRows, Traction, Traits
 from uem_dolfinx.contact.seam.pressure_map import PressureMap
 from uem_dolfinx.contact.seam.relative_motion import Ties
 from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.facets import facets_of, unit
 from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
-from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
+from uem_dolfinx.geometry.sharp import SHARP_EDGE
+from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
@@ -128,8 +132,6 @@ class NodeToSurface(OnTarget):
         """Which contactors ``(n,)`` past an end of the target have a facet over it ``(n,)`` (collective)."""
         if not isinstance(projection, FacetProjection) or self.contactor is None or self.contactor.dim == 0:
             return np.zeros(len(self.nodes), dtype=bool)
-        from uem_dolfinx.contact.nodes.overhang import overhanging
-
         return overhanging(self.config, self.nodes, self.contactor, projection, which)
 
     def _stuck(self, nearest: Projection, points: Array, state: PairState) -> Projection:
@@ -324,3 +326,42 @@ class NodalKinematics(PlacedOnTarget):
         """Values at the nodes, and at their closest points."""
         n = len(self.points)
         return (np.arange(n), self.of.config.to_global(self.of.nodes), np.ones(n)), NodalKinematics.weights(self)
+
+
+def close_to_ends(p: FacetProjection, which: Bools) -> Bools:
+    """Contactors of ``which (n,)`` that are past an end by at most ``END_HOLDS`` of the target's facet ``(n,)``."""
+    return np.asarray(which & (p.way_beyond > ON_SIDE * p.facet_size) & (p.way_beyond <= END_HOLDS * p.facet_size))
+
+
+def overhanging(config: Configuration, nodes: Indices, contactor: Tag, p: FacetProjection, which: Bools) -> Bools:
+    """Contactors past an end by at most ``END_HOLDS`` of one of their own facets, which faces the target and is over it ``(n,)``.
+
+    Collective.
+
+    Args:
+        config: configuration of the displacement.
+        nodes: owned contactor nodes ``(n,)``.
+        contactor: facets of the contactors.
+        p: projection of the contactors.
+        which: contactors that are looked at ``(n,)``.
+    """
+    g, near = config.gdim, close_to_ends(p, which)
+    if not reduced(config.comm, bool(near.any()), op=MPI.LOR):
+        return near
+    try:
+        own = facets_of(config, contactor, "contactor")
+    except OrientationError:
+        # a surface inside a body faces nothing
+        return np.zeros(len(nodes), dtype=bool)
+    at_nodes = np.zeros((config.n_owned, 2 * g))
+    at_nodes[nodes[near]] = np.column_stack([unit(p.beyond), p.normal])[near]
+    x, of_facets = own.x, own.nodes.ravel()
+    there = config.ask_owners(of_facets, at_nodes).reshape(*own.nodes.shape, 2 * g)
+    # along the way beyond the end, how far the facets' other nodes are behind each of their nodes
+    along = np.einsum("mag,mbg->mab", there[..., :g], x)
+    back = np.einsum("maa->ma", along) - along.min(axis=2, initial=np.inf)
+    facing = np.einsum("mag,mg->ma", there[..., g:], own.middles(x)[1]) < -SHARP_EDGE
+    node, back = config.send_to_owners(of_facets, np.where(facing, back, 0.0).ravel())
+    reach = np.zeros(config.n_owned)
+    np.maximum.at(reach, node, back)
+    return np.asarray(near & (p.way_beyond <= END_HOLDS * reach[nodes]))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.contact.laws.adhesion import Adhesion
+from uem_dolfinx.contact.laws.soft import Adhesion
 from uem_dolfinx.contact.pair.cohesive import SofteningInterface, together
 from uem_dolfinx.contact.pair.soft import stiffness_of_gaps
 from uem_dolfinx.contact.seam.placement import Traction

@@ -24,8 +24,8 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.friction.pivot import Pivot
     from uem_dolfinx.contact.friction.sliding import Sliding
+    from uem_dolfinx.contact.friction.stick_slip import Pivot
     from uem_dolfinx.contact.thermal.heat import Heat
     from uem_dolfinx.contact.ties.tie import Tie
     from uem_dolfinx.geometry.rigid import Motion
@@ -35,7 +35,6 @@ class Interface:
     """Contactors against one target.
 
     Args:
-        config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         discretisation: relates them to their target.
         friction: tangential part; None without friction.

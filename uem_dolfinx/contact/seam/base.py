@@ -26,7 +26,6 @@ class OnTarget:
     """Contactors of one target.
 
     Args:
-        config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         target: target of the contactors.
         free: components without Dirichlet condition of all owned nodes ``(n_owned, gdim)``.

@@ -163,7 +163,6 @@ class GapRows:
     Rows along the contact normals come first, one for each contactor in their order; those of further axes of corners follow.
 
     Attributes:
-        config: configuration of the displacement.
         equations: the constraint equations with gaps ``gap / scale``, all inactive ``(m,)``.
         scale: deciding gaps over the gaps of the equations ``(n,)``.
         free: components of the contactors without Dirichlet condition ``(n, gdim)``.

@@ -17,7 +17,6 @@ class Sums(NamedTuple):
     """A sparse matrix S over the contactors of all ranks.
 
     Attributes:
-        config: configuration of the displacement.
         nodes: owned contactors ``(n,)``.
         column: index of the contactor of each entry ``(k,)``.
         row: local node of each entry ``(k,)``.
@@ -70,7 +69,6 @@ class Stretch:
     """Factor of pressures: a power of nodal sums of facet shares over the same sums in the reference configuration.
 
     Attributes:
-        config: configuration of the displacement.
         nodes: owned contactors ``(n,)``.
         dofs: local nodes of the facets ``(m, nn)``.
         shares: function of node positions ``(m, nn, gdim)`` that returns shares ``(m, nn)`` and derivatives ``(m, nn, nn, gdim)``.

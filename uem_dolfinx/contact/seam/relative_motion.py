@@ -21,7 +21,6 @@ class Ties:
     """Weights by which contactors follow other nodes, and the free components of their relative motion.
 
     Attributes:
-        config: configuration of the displacement.
         nodes: owned contactors ``(n,)``.
         row: index of the contactor of each term ``(k,)``.
         followed: global node of each term ``(k,)``.

@@ -22,7 +22,7 @@ import numpy as np
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.conductance import Conductance
-from uem_dolfinx.contact.laws.constants import value
+from uem_dolfinx.contact.laws.soft import value
 from uem_dolfinx.contact.seam.dyads import Terms, dyads
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics
 from uem_dolfinx.contact.seam.state import PairState
@@ -30,8 +30,7 @@ from uem_dolfinx.contact.thermal.sides import Sides, sides_of
 from uem_dolfinx.contact.thermal.sources import FrictionalHeat, JouleHeat, Source
 from uem_dolfinx.errors import InputError, SpaceError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.fields import ConfigurationAmongFields
-from uem_dolfinx.geometry.nodal_fields import NodalField, nodal_field
+from uem_dolfinx.geometry.fields import ConfigurationAmongFields, NodalField, nodal_field
 from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.parallel import reduced
 
@@ -129,7 +128,6 @@ class Heat:
     """Heat through one interface.
 
     Args:
-        pair: the interface.
         law: conductance.
         contact: source of areas and pressures.
         column: column of ``PairState.heat``, for a perfect conductance.

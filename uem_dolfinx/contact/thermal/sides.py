@@ -8,12 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Indices, Ints
-from uem_dolfinx.contact.laws.constants import value
+from uem_dolfinx.contact.laws.soft import value
 from uem_dolfinx.contact.seam.placement import Kinematics
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.fields import ConfigurationAmongFields
-from uem_dolfinx.geometry.nodal_fields import nodal_field
+from uem_dolfinx.geometry.fields import ConfigurationAmongFields, nodal_field
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.projection import Projection
 
@@ -30,7 +29,6 @@ class Sides:
     """Both sides of contactors at one placement.
 
     Attributes:
-        projection: of the contactors.
         halo: of the nodes in all terms.
         node: global node of each term ``(k,)``.
         row: index of the contactor of each term ``(k,)``.

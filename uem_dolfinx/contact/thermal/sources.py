@@ -9,7 +9,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.laws.conductance import Conductance
-from uem_dolfinx.contact.laws.constants import value
+from uem_dolfinx.contact.laws.soft import value
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
 from uem_dolfinx.contact.seam.dyads import Terms
 from uem_dolfinx.errors import InputError

@@ -32,7 +32,6 @@ class Tie:
     """Permanent tie of contactors of one interface to the target.
 
     Args:
-        config: configuration of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         discretisation: of the interface.
         name: for messages.

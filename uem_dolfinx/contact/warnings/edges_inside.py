@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uem_dolfinx.arrays import Bools, Ints
-from uem_dolfinx.geometry.crossing_edges import Crossing, SharpEdges, find_crossing
+from uem_dolfinx.geometry.crossings import Crossing, SharpEdges, find_crossing
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.skin import Apart, Skin
 from uem_dolfinx.log import logger

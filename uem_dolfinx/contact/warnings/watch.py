@@ -144,7 +144,7 @@ class Watch:
 
             self._rigid_sides = RigidSides(contacts, rigid)
         if contacts and contacts[0].config.equations:
-            from uem_dolfinx.contact.warnings.seams import warn_of_seams
+            from uem_dolfinx.contact.warnings.rigid_sides import warn_of_seams
 
             warn_of_seams([contact.pair for contact in contacts])
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.contact.general.general import GeneralContact
-from uem_dolfinx.contact.laws.viscous import ViscousFriction
-from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
+from uem_dolfinx.contact.laws.stribeck import ViscousFriction
+from uem_dolfinx.dynamics.scheme import CentralDifferences
 from uem_dolfinx.errors import InputError
 
 

@@ -17,11 +17,47 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.dynamics.explicit.critical import highest_eigenvalue
-from uem_dolfinx.dynamics.explicit.surface import Prediction
-from uem_dolfinx.dynamics.explicit.surface_solver import SurfaceSolver
+from uem_dolfinx.dynamics.explicit.part_solver import Prediction, SurfaceSolver
 from uem_dolfinx.errors import InvertedElementError, MassError, StepAccuracyError
 from uem_dolfinx.parallel import gathered, reduced
+
+#: Products with the stiffness of one estimate: Ritz values and the size of their residuals then bound the highest frequency to a few per
+#: cent, less than the safety of steps takes off.
+#: [bound; products; -]
+PRODUCTS = 20
+
+
+def highest_eigenvalue(apply: Callable[[Array], Array], mass: Array, start: Array, comm: MPI.Comm) -> float:
+    """Estimate from above of the largest eigenvalue of ``M^-1/2 K M^-1/2`` (collective).
+
+    Args:
+        apply: K times a field ``(n,)`` (collective).
+        mass: diagonal of M, zero at components that do not move ``(n,)``.
+        start: of the Krylov space ``(n,)``, the same for every partition of the mesh.
+        comm: of the fields.
+    """
+    root = np.where(mass > 0.0, 1.0 / np.sqrt(np.where(mass > 0.0, mass, 1.0)), 0.0)
+
+    def dot(x: Array, y: Array) -> float:
+        return float(reduced(comm, float(x @ y)))
+
+    q = start * (mass > 0.0)
+    q, before, beta = q / np.sqrt(dot(q, q)), np.zeros_like(q), 0.0
+    alphas, betas = [], []
+    for _ in range(PRODUCTS):
+        r = root * apply(root * q)
+        alphas.append(dot(q, r))
+        r -= alphas[-1] * q + beta * before
+        beta = np.sqrt(dot(r, r))
+        betas.append(beta)
+        if beta <= np.finfo(float).eps * max(map(abs, alphas)):
+            break
+        before, q = q, r / beta
+    k = len(alphas)
+    T = np.diag(alphas) + np.diag(betas[: k - 1], 1) + np.diag(betas[: k - 1], -1)
+    values, vectors = np.linalg.eigh(T)
+    return float(values[-1] + betas[-1] * abs(vectors[-1, -1]))
+
 
 #: A surface at rest makes the square of the highest frequency much larger if by more than this factor: contacts then change the step.
 #: [convention; square of the highest frequency; test_explicit.py::test_stiff_contactors_do_not_shorten_steps]
@@ -171,17 +207,7 @@ class ExplicitStepper:
         return float(4.0 / (c + np.sqrt(c**2 + 4.0 * k)))
 
     def _refuse_cells(self, dt: float, a: Array, before: tuple[int, ...]) -> None:
-        """Refuse a step that turns a cell inside out, or is beyond the critical one of a state that differs much (collective).
-
-        Args:
-            dt: length of the step.
-            a: accelerations at its end ``(n,)``.
-            before: ``pattern`` at its beginning.
-
-        Raises:
-            InvertedElementError: with the place.
-            StepAccuracyError: with both lengths.
-        """
+        """InvertedElementError for a cell turned inside out, StepAccuracyError for a step beyond the new critical one (collective)."""
         problem, bodies, config, changed = self.problem, self.problem.bodies, self.problem.config, False
         if bodies.linear:
             # forces by a product do not show inverted cells
@@ -203,11 +229,7 @@ class ExplicitStepper:
             )
 
     def _refuse_given_energy(self, dt: float) -> None:
-        """Refuse a step in which contacts that open do work on the bodies, with half of their last force (collective).
-
-        Raises:
-            EnergyGivenError: if this exceeds the limit, and a shorter step may be better.
-        """
+        """EnergyGivenError if contacts that open do more work on the bodies, with half of their last force, than the limit (collective)."""
         problem, control, given = self.problem, self.problem.step_control, 0.0
         for pair in problem.system.pairs:
             opened = pair.committed.active & ~pair.trial.active

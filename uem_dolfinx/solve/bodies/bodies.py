@@ -24,7 +24,7 @@ from uem_dolfinx.geometry.bodies import find_bodies, linked_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.parallel import agreed, reduced
-from uem_dolfinx.solve.bodies.norms import first
+from uem_dolfinx.solve.bodies.field_scales import first
 from uem_dolfinx.solve.bodies.tangent import Inversions, Tangent
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ class Bodies:
     """Bodies in statics and dynamics, before contact.
 
     Args:
-        config: configuration of the displacement.
         F: UFL residual, damping included.
         bcs: Dirichlet conditions.
         materials: with history, whose stresses are brought up to date before the residual is assembled.
@@ -61,7 +60,6 @@ class Bodies:
         J: tangent of users in place of the derivative of F, or None.
 
     Attributes:
-        F: the residual.
         unknowns: rows of vectors and matrices; the nodes, unless there are other fields.
         held: unknowns with a Dirichlet condition, ghosts included ``(n,)``.
         free: components of the displacement without Dirichlet condition ``(n_local, gdim)``.
@@ -429,7 +427,7 @@ def configured(u: fem.Function, displacement: int | None) -> Configuration:
         V = u.function_space
         if V.dofmap.index_map_bs > 1 or compat.is_mixed(V):
             return Configuration(u)
-        from uem_dolfinx.geometry.scalar import ScalarConfiguration
+        from uem_dolfinx.geometry.fields import ScalarConfiguration
 
         return ScalarConfiguration(u)
     from uem_dolfinx.geometry.fields import ConfigurationAmongFields

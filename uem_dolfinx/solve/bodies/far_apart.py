@@ -57,10 +57,6 @@ class FarApart:
     """Contacts of a problem that are not searched (collective).
 
     Only node-to-surface contacts with finite sliding can be skipped, with meshes, or with rigid surfaces whose gap is a distance.
-
-    Args:
-        config: configuration of the displacement.
-        pairs: of all contacts.
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface]):

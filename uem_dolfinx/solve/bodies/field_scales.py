@@ -7,7 +7,7 @@ that neither a rigid translation nor a temperature far from zero makes an equati
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from petsc4py import PETSc
@@ -17,8 +17,27 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.fields import Unknowns
 from uem_dolfinx.geometry.nodes import Halo
-from uem_dolfinx.solve.bodies.norms import first
 from uem_dolfinx.solve.bodies.tangent import Tangent
+
+#: A norm of forces; in mixed problems one for each field, with the displacement's first ``(n_fields,)``.
+Norm: TypeAlias = float | Array
+
+
+def first(norm: Norm) -> float:
+    """The displacement's part of a norm."""
+    return float(np.ravel(norm)[0])
+
+
+def ratio(norm: Norm, scale: Norm) -> float:
+    """The largest ratio of a norm to a scale over all fields; 0 for a zero scale."""
+    return float(np.max(np.divide(norm, scale, out=np.zeros(np.shape(norm)), where=np.asarray(scale) > 0)))
+
+
+def worst(norm: Norm, rounding: Norm, real: Norm) -> tuple[float, float, float]:
+    """Residual, rounding and forces of the field with the largest residual relative to its forces."""
+    every = [np.atleast_1d(a) for a in np.broadcast_arrays(norm, rounding, real)]
+    k = int(np.argmax(every[0] / np.where(every[2] > 0.0, every[2], np.inf)))
+    return float(every[0][k]), float(every[1][k]), float(every[2][k])
 
 
 def driving(bodies: Any, test: Restriction, rhs: PETSc.Vec, du: PETSc.Vec) -> float:

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.dynamics.explicit.central_differences import CentralDifferences
+from uem_dolfinx.dynamics.scheme import CentralDifferences
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced

@@ -17,7 +17,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.algebra.entries import SYMMETRIC
+from uem_dolfinx.algebra.blocks import SYMMETRIC
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import slides
@@ -41,7 +41,6 @@ class Tangent:
 
     Args:
         F: UFL residual.
-        config: configuration of the displacement.
         materials: laws with stresses that are no expressions of u; they add their stiffness.
         dynamics: inertia, which adds a multiple of M, or None.
         points: loads and springs at nodes, or None.
@@ -284,11 +283,7 @@ def together(A: PETSc.Mat | None, B: PETSc.Mat | None) -> PETSc.Mat | None:
 
 
 class Inversions:
-    """Search for cells that the displacement inverts.
-
-    Args:
-        config: configuration of the displacement.
-    """
+    """Search for cells that the displacement inverts."""
 
     def __init__(self, config: Configuration):
         self.config = config

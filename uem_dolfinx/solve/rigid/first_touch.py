@@ -80,12 +80,7 @@ def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequ
 
 
 def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[[Bools], Bools] | None:
-    """Function from a mask of nodes to the mask of owned nodes of target facets at these nodes ``(n_owned,)``; None without sliding.
-
-    Args:
-        config: configuration of the displacement.
-        pairs: of all contacts.
-    """
+    """Function from a mask of nodes to the mask of owned nodes of target facets at these nodes ``(n_owned,)``; None without sliding."""
     moving = [pair.target for pair in pairs if slides(pair) and pair.target.n_nodes and pair.tie is None]
     facets = list({id(target.dofs): target.dofs for target in moving}.values())
     every = np.arange(config.n_local)

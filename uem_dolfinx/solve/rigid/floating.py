@@ -70,8 +70,6 @@ class FloatingBodies:
     """Treatment of bodies that only contact holds, within a step.
 
     Args:
-        bodies: without contact.
-        pairs: of all contacts.
         linear: equations of users, or None.
         far_apart: contacts that are not searched until bodies come near.
 
@@ -169,11 +167,7 @@ class FloatingBodies:
         logger.warning(told)
 
     def _refuse_thrown(self) -> None:
-        """Refuse a step in which contacts have pushed a body so far that they no longer hold it (collective).
-
-        Raises:
-            ThrownBodyError: names the body.
-        """
+        """ThrownBodyError for a step in which contacts have pushed a body so far that they no longer hold it (collective)."""
         motions, config = self.motions, self._bodies.config
         assert motions is not None
         if not self._open.shape[1]:

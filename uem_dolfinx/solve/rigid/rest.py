@@ -37,12 +37,7 @@ MOST_DRAGGED, MOST_FAILED = 40, 6
 
 
 class _Drag:
-    """Drag at the nodes, with the loads and springs at points of the problem, in the place of these.
-
-    Args:
-        problem: at the state in which the drag begins.
-        largest: drag of every owned node ``(n_owned,)``.
-    """
+    """Drag at the nodes, up to ``largest (n_owned,)``, with the loads and springs at points of the problem, in the place of these."""
 
     def __init__(self, problem: Any, largest: Array):
         self._config, self._points, self._largest, self.factor = problem.config, problem.bodies.tangent.points, largest, 1.0

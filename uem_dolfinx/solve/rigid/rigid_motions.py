@@ -44,7 +44,6 @@ class RigidMotions:
     middle in units of its radius, so that all entries are lengths. Several motions are the columns of a sparse matrix.
 
     Args:
-        config: configuration of the displacement.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
         finite: whether rotations of bodies are finite, not linearised.
 

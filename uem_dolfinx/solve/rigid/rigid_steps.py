@@ -15,8 +15,8 @@ from mpi4py import MPI
 
 import numpy as np
 
+from uem_dolfinx.algebra.dependent import least_squares
 from uem_dolfinx.algebra.equations import NEGLIGIBLE
-from uem_dolfinx.algebra.nonnegative import least_squares
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.solve.rigid.rigid_motions import blocks_of, by_block
 

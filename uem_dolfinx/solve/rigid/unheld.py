@@ -15,7 +15,7 @@ from uem_dolfinx.geometry.bodies import find_bodies, middle
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.bodies import Bodies
-from uem_dolfinx.solve.bodies.norms import ratio
+from uem_dolfinx.solve.bodies.field_scales import ratio
 
 
 def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uem_dolfinx.algebra.entries import SYMMETRIC
+from uem_dolfinx.algebra.blocks import SYMMETRIC
 from uem_dolfinx.arrays import Array, Bools, Ints
 
 #: Conditions hold if no force violates them by more than this part of the terms of ``stiffness @ w + load``.

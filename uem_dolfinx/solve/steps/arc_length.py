@@ -172,7 +172,6 @@ class AlongArc:
     The step after all damage that grew has separated has a given load as well, as the way that led there may have gone back.
 
     Args:
-        problem: the problem.
         by: energy to dissipate in a step; None for the arc length alone.
 
     Attributes:

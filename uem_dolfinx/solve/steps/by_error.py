@@ -91,7 +91,6 @@ class ByError(ByLoad):
     must lead straight from the beginning of each half to its end, up to the tolerance: the halves would not see where they turn.
 
     Args:
-        problem: the problem.
         tolerance: bound on the error of a step, relative to the largest change over the whole load at the speeds so far. The error over the
             length does not vanish with it in steps where contactors begin to slip, or material to yield, so that it has no bound.
     """
@@ -144,11 +143,7 @@ class ByError(ByLoad):
         return float(np.sqrt(found))
 
     def _refuse_error(self, start: Reached, at_once: Reached, halves: Reached, length: float, turn: float) -> None:
-        """Refuse halves that differ too much from a step at once; find whether the next step may be longer (collective).
-
-        Raises:
-            StepAccuracyError: above the tolerance.
-        """
+        """StepAccuracyError for halves that differ too much from a step at once; find whether the next may be longer (collective)."""
         problem, control = self._problem, self._problem.progress.control
         stiffness = problem.bodies.stiffness
         assert stiffness is not None

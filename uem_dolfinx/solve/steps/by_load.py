@@ -15,9 +15,6 @@ from uem_dolfinx.solve.united.newton import Iteration
 class ByLoad:
     """Advances a problem by steps of given load.
 
-    Args:
-        problem: the problem.
-
     Attributes:
         tried: intended load increment of the last step.
         most: largest number of steps relative to the nominal one, here unlimited.

@@ -20,7 +20,7 @@ from uem_dolfinx.solve.steps.load_step import LoadStep
 if TYPE_CHECKING:
     from uem_dolfinx.restart.checkpoint import Checkpoint
     from uem_dolfinx.solve.steps.arc_length import AlongArc
-    from uem_dolfinx.solve.steps.step import Step
+    from uem_dolfinx.solve.steps.stages import Step
 
 
 def load_steps(

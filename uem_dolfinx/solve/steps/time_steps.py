@@ -229,20 +229,11 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
-    """Refuse a step in which contacts have added energy beyond the limit; with massive contactors only warn (collective).
+    """EnergyGivenError for a step in which contacts have added energy beyond the limit; with massy contactors a warning (collective).
 
     In the trapezoidal rule, contactors that are released or slide round a bend do work with half of their initial force; it decreases
     with the step length. A contactor that has sunk past the target's end and is put back causes an impact in any step, and is ignored
     from the next attempt on. Contactors with mass gain energy in steps of any length.
-
-    Args:
-        problem: at the end of the step.
-        dynamics: of the problem.
-        length: of the step.
-        before: contact forces at its beginning.
-
-    Raises:
-        EnergyGivenError: if a shorter step or another attempt may be better.
     """
     control = problem.step_control
     if not (forces := before + _contact_forces(problem)):

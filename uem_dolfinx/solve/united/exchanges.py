@@ -34,7 +34,7 @@ from uem_dolfinx.solve.rigid.floating import FAR
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.contact.friction.pivot import Pivot
+    from uem_dolfinx.contact.friction.stick_slip import Pivot
     from uem_dolfinx.solve.united.newton import Increment
 
 #: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
@@ -71,14 +71,7 @@ NAMED = 3
 
 @dataclass(frozen=True)
 class _Visit:
-    """A state visited before equilibrium.
-
-    Attributes:
-        state: its fingerprint.
-        norm: of the residual.
-        patterns: of every pair.
-        changed: masks of contactors of every pair that have changed state since the previous visit.
-    """
+    """A state visited before equilibrium: its fingerprint, norm of the residual, patterns of pairs, contactors that have changed since."""
 
     state: object
     norm: float
@@ -88,9 +81,6 @@ class _Visit:
 
 class Exchanges:
     """Chooses among the contactors that violate their conditions, in all pairs; all methods are collective.
-
-    Args:
-        pairs: of all contacts.
 
     Attributes:
         straight: whether the linearised problem neglects the curvature of contact, and softening where bodies may jump.

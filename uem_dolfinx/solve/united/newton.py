@@ -19,8 +19,7 @@ from uem_dolfinx.arrays import Ints
 from uem_dolfinx.errors import ConvergenceError
 from uem_dolfinx.log import logger, say
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
-from uem_dolfinx.solve.bodies.field_scales import driving
-from uem_dolfinx.solve.bodies.norms import Norm, first, ratio, worst
+from uem_dolfinx.solve.bodies.field_scales import Norm, driving, first, ratio, worst
 from uem_dolfinx.solve.bodies.tangent import not_finite
 from uem_dolfinx.solve.rigid.unheld import no_precision, unheld
 
@@ -344,15 +343,7 @@ def _solve_linearised(
     relative: float,
     check_signals: Callable[[], None] | None,
 ) -> tuple[LinearisedProblem, Increment, int, int]:
-    """Solve the linearised problem together with the conditions of contact; nothing moves.
-
-    Args:
-        method: how contact is imposed.
-        state: initial state.
-        iteration: number of this iteration.
-        wanted: norm of the residual required for convergence.
-        relative: residual over the forces at work.
-        check_signals: see ``solve_united``.
+    """Solve the linearised problem together with the conditions of contact, from this state; nothing moves.
 
     Returns:
         The problem whose active set agrees with its solution, the solution, and the numbers of linear iterations and of exchanges.

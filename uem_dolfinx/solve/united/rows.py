@@ -38,7 +38,6 @@ class OverConstraints:
     """Shared nodes of the equations of several contacts (collective).
 
     Args:
-        config: configuration of the displacement.
         pairs: of all contacts; ``mutual`` of their settings is set if surfaces are contactor and target of each other.
         linear: equations of users, or None.
 
@@ -383,16 +382,7 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
 
 
 def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
-    """Equations that conflicted, rotated where contactors slip (collective).
-
-    Args:
-        pairs: of all contacts.
-        independent: their resolution without friction.
-        test: rotated equations of all pairs.
-
-    Raises:
-        FrictionError: names the first contactor whose equations no longer determine its motion.
-    """
+    """Equations that conflicted, rotated where contactors slip; FrictionError if they no longer determine a contactor's motion."""
     rotated = independent.rotated(test)
     _refuse_wedged(pairs, test, rotated.undetermined)
     return rotated

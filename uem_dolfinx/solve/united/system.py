@@ -22,7 +22,7 @@ from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed,
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
-from uem_dolfinx.solve.bodies.norms import first
+from uem_dolfinx.solve.bodies.field_scales import first
 from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, known_forces, slip_terms, together
 from uem_dolfinx.solve.rigid.first_touch import nodes_beside, touch_ahead
 from uem_dolfinx.solve.rigid.floating import FloatingBodies
@@ -50,7 +50,6 @@ class BodySystem:
     """Bodies whose active contactors are eliminated.
 
     Args:
-        bodies: without contact.
         pairs: of all contacts, newly made.
         solver: of the constrained system.
         newton: ``"full"`` or ``"modified"``.
