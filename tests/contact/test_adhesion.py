@@ -59,10 +59,12 @@ def test_pull_off_of_a_sphere(coupling):
     assert pulls[0] > 0 and min(pulls) == pytest.approx(-1.5 * np.pi * w * R, rel=0.04)
 
 
-@pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron")])
-def test_the_tangent_is_the_derivative(cell):
+@pytest.mark.parametrize(
+    "cell,degree", [("triangle", 1), ("quadrilateral", 2), slow("tetrahedron", 1), slow("tetrahedron", 2), slow("hexahedron", 2)]
+)
+def test_the_tangent_is_the_derivative(cell, degree):
     """On arched surfaces with open gaps, stiffness and curvature of the attraction are the derivative of the residual."""
-    b = blocks(COMM, cell, 3, 4, pose=arch(0.2), gap=0.02)
+    b = blocks(COMM, cell, 3, 4, pose=arch(0.2), gap=0.02, degree=degree)
     contact = uem.Contact(b.high, b.low, cohesion=uem.Adhesion(0.02, 0.2))
     problem = uem.UnitedProblem(st_venant(b.u, 1.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
     system, pair, config = problem.system, contact.pair, problem.config

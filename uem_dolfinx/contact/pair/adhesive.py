@@ -15,7 +15,7 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.laws.soft import Adhesion
 from uem_dolfinx.contact.pair.cohesive import SofteningInterface, together
-from uem_dolfinx.contact.pair.soft import stiffness_of_gaps
+from uem_dolfinx.contact.pair.soft import stiffness_of_gaps, traction_by_gaps
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.seam.state import PairState
 
@@ -75,10 +75,9 @@ class AdhesiveInterface(SofteningInterface):
 
     def curvature(self, state: PairState | None = None) -> list[tuple[Ints, Array]]:
         """See ``Interface``; the attraction bends as the contact forces do (collective)."""
-        share = self.kinematics.pressure_map(False).force
-        none, lam = np.zeros(len(share), dtype=bool), self._pull * share
-        t = self.trial
-        pulled = replace(t, active=none, lam=lam, nodal=lam, force=0.0 * t.force, held=np.full_like(t.held, -1))
+        t, found = self.trial, traction_by_gaps(self, self._pull)
+        pulled = replace(t, active=np.zeros_like(t.active), lam=found.lam, nodal=found.nodal, force=0.0 * t.force)
+        pulled = replace(pulled, held=np.full_like(t.held, -1))
         return super().curvature(state) + self.kinematics.curvature(pulled)
 
     # -- results ---------------------------------------------------------------------------------------------------------

@@ -59,6 +59,13 @@ def stiffness_of_gaps(pair: Interface, stiffness: Array) -> tuple[Ints, Ints, Ar
     return grouped(np.append(stiffness, np.zeros(len(rows.equations) - len(stiffness))), gradients, gradients)[:3]
 
 
+def traction_by_gaps(pair: Interface, multipliers: Array) -> Traction:
+    """Contact forces of multipliers ``(n,)`` of the rows of all gaps, without those along further axes of corners (collective)."""
+    every = np.ones(len(pair.nodes), dtype=bool)
+    rows = pair.kinematics.gap_rows.select(np.arange(len(every)), every)
+    return pair.kinematics.forces(replace(pair.trial, active=every), rows, np.where(rows.normal, multipliers[rows.contactor], 0.0))
+
+
 class _Edges:
     """In place of ``ConcaveEdges``: facets press alone, also in corners; contactors that alternate between them get averaged normals."""
 
@@ -134,7 +141,7 @@ class SoftInterface(Interface):
         self._multipliers, self._stiffness = self._area * p / self._force, -self._area * slope / self._force**2
         self._holds = (self._area > 0.0) & (slope < 0.0) & (slope <= HELD_FROM * stiff)
         self._stops = stiff < 0.0
-        super().set_forces(self._traction(self._multipliers))
+        super().set_forces(traction_by_gaps(self, self._multipliers))
 
     def _of_law(self, gap: Array) -> tuple[Array, Array]:
         """Pressures p and their derivatives at gaps ``(n,)`` (collective)."""
@@ -188,12 +195,6 @@ class SoftInterface(Interface):
         """Gaps of the law ``(n,)``: of nodes, in Bernstein's basis at degree 2, or means with the dual functions (collective)."""
         return np.asarray(self.kinematics.gap_rows.equations.gap[: len(self.nodes)] / self._force)
 
-    def _traction(self, multipliers: Array) -> Traction:
-        """Contact forces of multipliers ``(n,)`` (collective)."""
-        every = np.ones(len(self.nodes), dtype=bool)
-        rows = self.kinematics.gap_rows.select(np.arange(len(every)), every)
-        return self.kinematics.forces(replace(self.trial, active=every), rows, multipliers[rows.contactor])
-
     def forces(self, equations: ContactRows, multipliers: Array, du: Array | None = None) -> Traction:
         """Contact forces, present or predicted by the linearised law; see ``Interface`` (collective)."""
         if du is None or not self._acts:
@@ -202,7 +203,7 @@ class SoftInterface(Interface):
         ahead = rows.equations.gap[: len(force)] + rows.along(du)
         predicted = self._multipliers - self._stiffness * (ahead - force * self._at)
         self._predicted = ahead / force, predicted
-        return self._traction(np.maximum(predicted, 0.0))
+        return traction_by_gaps(self, np.maximum(predicted, 0.0))
 
     def set_forces(self, found: Traction, active: Bools | None = None) -> None:
         """Set contact forces of the trial state; predicted ones hold from the next placement on (collective)."""
