@@ -8,7 +8,7 @@ The massless surface of Doyen, Ern and Piperno, SIAM J. Sci. Comput. 33 (2011) 2
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
@@ -143,3 +143,8 @@ class CentralDifferences:
     def ending(self, v: Array, a: Array, dt: float) -> tuple[float, Array, float, Array]:
         """Coefficients of the rates of the surface at the end of a step, see ``Scheme.ending``: no acceleration, the mean velocity."""
         return 0.0, 0.0 * a, 1.0 / dt, 0.0 * v
+
+
+def is_explicit(dynamics: Any) -> bool:
+    """Whether these dynamics, or None, take explicit steps."""
+    return dynamics is not None and isinstance(dynamics.scheme, CentralDifferences)

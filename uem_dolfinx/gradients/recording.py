@@ -11,7 +11,7 @@ from uem_dolfinx import given
 from uem_dolfinx.contact.laws.coulomb import Coulomb
 from uem_dolfinx.contact.laws.law import as_law, follows_load
 from uem_dolfinx.contact.mortar.placement import MortarKinematics
-from uem_dolfinx.dynamics.explicit.refused import is_explicit
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.gradients.gradient import AnyControl, check_controls, check_problem
 from uem_dolfinx.gradients.history import History

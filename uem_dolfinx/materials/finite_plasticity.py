@@ -192,7 +192,7 @@ class FinitePlasticity(VonMises):
                 stress[:, :3] += (self._bulk[:, None] * logarithm).reshape(-1, 1)
                 stress *= np.exp(-logarithm).reshape(-1, 1)
             self._refuse_infinite(stress)
-            self._trial, self._differentiated = flowed, False
+            self._trial, self._differentiated, self._at = flowed, False, np.array(self.u.x.array)
             self._points.write(self._piola, flowed.first_piola)
             self._points.write(self.stress, stress)
 

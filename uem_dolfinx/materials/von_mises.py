@@ -24,7 +24,7 @@ from uem_dolfinx.log import timed
 from uem_dolfinx.materials.elastic import KINDS, POISSON, Kind, check_kind, green_lagrange
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints, owned_cells
 from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
-from uem_dolfinx.parallel import agree
+from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
     from uem_dolfinx.materials.hardening import YieldCurve
@@ -127,8 +127,8 @@ class VonMises(given.Sealed):
         #: The displacement in UFL.
         self._moved = u if displacement is None else ufl.split(u)[displacement]
         self.cells = owned_cells(self.mesh, cells)
-        rules = (QuadraturePoints(self.mesh, self.cells, rule) for rule in self._degrees(degree, quadrature_degree))
-        self._points, self._pressure_points = rules
+        degrees = self._degrees(degree, quadrature_degree)
+        self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, one) for one in degrees)
         self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
         self._told = self.handed | {"cells": cells}
         #: Yield stress over peeq; with a table, the yield curve of the layers.
@@ -138,7 +138,7 @@ class VonMises(given.Sealed):
         self._create_functions()
         self._compile()
         self._spread = self._points.spread_from(self._pressure_points)
-        #: Outcome of the last update.
+        #: Outcome of the last update, which was at a displacement ``_at``.
         self._trial: Returned | Flowed
         self.update()
 
@@ -306,9 +306,6 @@ class VonMises(given.Sealed):
         Args:
             du: trial function.
             v: test function.
-
-        Returns:
-            The form.
         """
         A, B = self._variation(du), self._variation(v)
         tangent = self._a * ufl.inner(A, B) + self._c * ufl.tr(A) * ufl.tr(B)
@@ -327,10 +324,10 @@ class VonMises(given.Sealed):
                 if self.kind != "plane_stress":
                     stress[:, :3] += (self._bulk[:, None] * (self._volume_changes() @ self._spread.T)).reshape(-1, 1)
             self._refuse_infinite(stress)
-            self._trial = trial
-            for f, values in ((self._s, trial.stress), (self._a, trial.a), (self._c, trial.c), (self._m, trial.m)):
-                self._points.write(f, values)
-            self._points.write(self.stress, stress)
+            self._trial, self._at = trial, np.array(self.u.x.array)
+            values = trial.stress, trial.a, trial.c, trial.m, stress
+            for f, own in zip((self._s, self._a, self._c, self._m, self.stress), values):
+                self._points.write(f, own)
 
     def _returned(self) -> Returned:
         """Stress, history and tangent at the present displacement, from the committed history."""
@@ -344,7 +341,7 @@ class VonMises(given.Sealed):
 
     def _committed(self) -> tuple[Array, Array]:
         """Plastic strain ``(n, k)`` and peeq ``(n,)`` of all points, with layers one after another."""
-        strains, peeq = self._points.read(self.plastic_strain), self._points.read(self.peeq)
+        strains, peeq = map(self._points.read, self.history.values())
         return strains.reshape(peeq.size, strains.shape[1] // peeq.shape[1]), peeq.ravel()
 
     def _mean(self, values: Array) -> Array:
@@ -396,14 +393,16 @@ class VonMises(given.Sealed):
     @timed("commit history")
     def commit(self) -> None:
         """Make the state of the last ``update`` the history (collective)."""
-        self._points.write(self.plastic_strain, self._trial.plastic_strain)
-        self._points.write(self.peeq, self._trial.peeq)
-        for f in self.history.values():
+        for f, values in zip(self.history.values(), (self._trial.plastic_strain, self._trial.peeq)):
+            self._points.write(f, values)
             f.x.scatter_forward()
 
     def energy(self) -> float:
         """Elastic energy at the present displacement, plus the energy of the back stress (collective)."""
-        self.update()
+        # a committed update at this displacement is not repeated
+        known = self._at, self._trial.plastic_strain, self._trial.peeq
+        if reduced(self.comm, not all(map(np.array_equal, known, (self.u.x.array, *self._committed())))):
+            self.update()
         pressed = (self._bulk[:, None] * self._volume_changes() ** 2).ravel()
         return self._points.integrate(self._trial.energy) + self._pressure_points.integrate(pressed) / 2
 

@@ -12,7 +12,7 @@ import ufl
 
 from uem_dolfinx import forms, given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.dynamics.explicit.refused import is_explicit
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.files import given_resume
 from uem_dolfinx.form_checks import check_functional, check_linear
@@ -139,11 +139,12 @@ class EnergyBook(Closing, given.Sealed):
         #: Number of steps up to this instant, and the mean velocity of the last one ``(n,)``.
         self._steps, self._rate = problem.step_control.number, np.array(self.dynamics.mean_velocity.x.array[:n])
         contact = sum((c.force.x.array[:n] for c in self._contacts), np.zeros(n))
-        problem.bodies.assemble()
         # the work of supports on mass, with jumps of velocity, is the change of its kinetic energy, see ``driven``
-        driving = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
+        if (known := problem.bodies.driving) is None:
+            problem.bodies.assemble()
+            known = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
-        reaction = (driving - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
+        reaction = (known[:n] - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
         if problem.bodies.tangent.points is not None:
             outer += problem.bodies.tangent.points.loads().ravel()

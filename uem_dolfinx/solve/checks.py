@@ -183,7 +183,7 @@ def check_hold(problem: Any) -> None:
     """Raise an InputError unless the conditions of a problem can be replaced between time steps."""
     if problem.dynamics is None:
         raise InputError("hold() is for time steps: in statics take load_steps(problem, [Step(bcs=...)])")
-    from uem_dolfinx.dynamics.explicit.refused import is_explicit
+    from uem_dolfinx.dynamics.scheme import is_explicit
 
     if is_explicit(problem.dynamics):
         raise InputError("hold() does not go with CentralDifferences: take an implicit scheme, as uem.newmark()")

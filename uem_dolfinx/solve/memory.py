@@ -11,6 +11,7 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InputError, UEMError, UserFunctionError
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.parallel import agreed
@@ -28,9 +29,9 @@ class Memory:
         motions: of the pairs' rigid targets.
         pairs: state of each pair.
         of_users: multipliers and rotations of equations of users; None without.
-        histories: of the materials, values by name.
+        histories: of the materials, values by name; empty for explicit steps, which are not repeated.
         stiffness: diagonal of K ``(n_owned, block)``, which contacts use for directions before K is assembled again; None at first.
-        dynamics: state of the dynamics, None in statics.
+        dynamics: state of the dynamics; None in statics, and for explicit steps.
     """
 
     displacement: Array
@@ -45,15 +46,16 @@ class Memory:
     @classmethod
     def of(cls, problem: Any) -> Memory:
         """The last committed state of the problem."""
+        repeated = not is_explicit(problem.dynamics)
         return cls(
             displacement=problem.committed,
             largest_forces=problem.largest_forces,
             motions=problem.motions,
             pairs=[pair.committed for pair in problem.interfaces],
             of_users=None if problem.linear is None else problem.linear.memory(),
-            histories=[{name: np.array(f.x.array) for name, f in m.history.items()} for m in problem.materials],
+            histories=[{name: np.array(f.x.array) for name, f in m.history.items()} for m in problem.materials if repeated],
             stiffness=problem.bodies.stiffness_at_start,
-            dynamics=None if problem.dynamics is None else problem.dynamics.memory(),
+            dynamics=problem.dynamics.memory() if problem.dynamics is not None and repeated else None,
         )
 
     def put_back(self, problem: Any) -> None:
@@ -127,11 +129,8 @@ def take_again(problem: Any, before: Memory, led: tuple[Array | None, float, boo
         UEMError: as in ``UnitedProblem.attempt``, after the previous result has been restored.
     """
     start, fraction, arc = led
-    if problem.dynamics is not None:
-        from uem_dolfinx.dynamics.explicit.refused import is_explicit
-
-        if is_explicit(problem.dynamics):
-            raise InputError("explicit steps are not repeated: leave solve() out of the loop over time_steps")
+    if is_explicit(problem.dynamics):
+        raise InputError("explicit steps are not repeated: leave solve() out of the loop over time_steps")
     dynamics, now, moved, found = problem.dynamics, Memory.of(problem), problem.rigid_motions(), np.array(problem.u.x.array)
     before.put_back(problem)
     move_targets(problem, moved)

@@ -9,13 +9,8 @@ import numpy as np
 
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.stribeck import ViscousFriction
-from uem_dolfinx.dynamics.scheme import CentralDifferences
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InputError
-
-
-def is_explicit(dynamics: Any) -> bool:
-    """Whether these dynamics, or None, take explicit steps."""
-    return dynamics is not None and isinstance(dynamics.scheme, CentralDifferences)
 
 
 def refuse_unsupported(dynamics: Any, contacts: Any, others: Mapping[str, Any]) -> None:

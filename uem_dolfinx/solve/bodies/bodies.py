@@ -19,6 +19,7 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import check_fields
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, largest_of_groups
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InputError, NotFiniteError
 from uem_dolfinx.geometry.bodies import find_bodies, linked_bodies
 from uem_dolfinx.geometry.configuration import Configuration
@@ -110,6 +111,8 @@ class Bodies:
         #: Its value at the end of the last step, with which the next starts, and the state counter of the K that it was taken from.
         self.stiffness_at_start: Array | None = None
         self._stiffness_of = -1
+        #: Residual at the end of the last explicit step ``(n_rows * gdim,)``; None if another state is committed.
+        self.driving: Array | None = None
         self._fields: Any = None
         self._linked: tuple[Ints, int] | None = None
         if self.unknowns.mixed:
@@ -131,11 +134,9 @@ class Bodies:
 
     def assemble(self, write: Callable[[PETSc.Vec], None] | None = None) -> bool:
         """Assemble ``F(u)`` at the present displacement, or a part by ``write``; whether it is finite on all ranks (collective)."""
-        if self._assembled_at is not None:
-            same = reduced(self.comm, bool(np.array_equal(self._assembled_at, self.u.x.array)), op=MPI.LAND)
-            self._assembled_at = None
-            if same:
-                return True
+        known, self._assembled_at = self._assembled_at, None
+        if known is not None and reduced(self.comm, bool(np.array_equal(known, self.u.x.array)), op=MPI.LAND):
+            return True
         try:
             for material in self.materials:
                 material.update()
@@ -180,9 +181,7 @@ class Bodies:
 
     def _beside(self, norm: Any, more: Sequence[float]) -> Any:
         """A norm of forces, or one for each field ``(n_fields,)``, combined with other norms of the displacement's forces."""
-        if not more:
-            return norm
-        return np.hypot(norm, self.of_fields(float(np.linalg.norm(more))))
+        return np.hypot(norm, self.of_fields(float(np.linalg.norm(more)))) if more else norm
 
     @property
     def linear(self) -> bool:
@@ -239,9 +238,8 @@ class Bodies:
         """Forces due to rounding of the positions of owned nodes ``(n,)``, at these nodes ``(n,)``."""
         if self.stiffness is None:
             return np.zeros(len(nodes))
-        return np.asarray(
-            FORCE_ROUNDING * (np.abs(self.config.x[nodes]) * np.abs(self.stiffness[nodes])).max(axis=1, initial=0.0)
-        )
+        forces = np.abs(self.config.x[nodes]) * np.abs(self.stiffness[nodes])
+        return np.asarray(FORCE_ROUNDING * forces.max(axis=1, initial=0.0))
 
     def above_rounding(self, positioned: bool) -> Any:
         """Norm of the forces, or one for each field, at the components where they exceed rounding (collective).
@@ -400,6 +398,8 @@ class Bodies:
         for material in self.materials:
             material.commit()
         self.stiffness_at_start = self.stiffness
+        explicit = self.dynamics is not None and self.dynamics.moving and is_explicit(self.dynamics)
+        self.driving = np.array(self.residual.array_r) if explicit else None
 
     def restore(self) -> None:
         """Restore the committed state, after the displacement has been reset to the committed one."""
@@ -417,7 +417,7 @@ class Bodies:
 
     def from_checkpoint(self, u: fem.Function | None) -> None:
         """Restore the diagonal of K from a checkpoint; None if it was not known."""
-        n, g = self.config.n_owned, self.config.block
+        self.driving, n, g = None, self.config.n_owned, self.config.block
         self.stiffness = self.stiffness_at_start = None if u is None else np.array(u.x.array[: n * g]).reshape(n, g)
 
 

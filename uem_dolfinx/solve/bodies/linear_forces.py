@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.dynamics.scheme import CentralDifferences
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
@@ -32,7 +32,7 @@ def explicit_forces(bodies: Any, form: Any, J: ufl.Form | None) -> Callable[[PET
         J: tangent of users, or None.
     """
     dynamics = bodies.dynamics
-    if dynamics is None or not isinstance(dynamics.scheme, CentralDifferences) or dynamics.damping is not None:
+    if not is_explicit(dynamics) or dynamics.damping is not None:
         return None
     return LinearForces(bodies, form).assemble if bodies.linear and bodies.tangent.points is None and J is None else None
 

@@ -22,6 +22,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InvertedElementError, NotFiniteError, SpaceError, UEMError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.configuration import Configuration
@@ -295,10 +296,6 @@ class Inversions:
 
     def marked(self, F: ufl.Form, dynamics: Dynamics | None) -> ufl.Form:
         """The residual that steps of ``dynamics`` assemble, F: in explicit steps NaN where points of its cells are turned inside out."""
-        if dynamics is None:
-            return F
-        from uem_dolfinx.dynamics.explicit.refused import is_explicit
-
         if not is_explicit(dynamics):
             return F
         nothing = (

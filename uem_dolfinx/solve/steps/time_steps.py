@@ -15,8 +15,8 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.dynamics.explicit.refused import is_explicit
 from uem_dolfinx.dynamics.inertia import Dynamics
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InputError, PrecisionError, SpaceError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
