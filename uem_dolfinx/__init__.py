@@ -129,7 +129,8 @@ if _TYPE_CHECKING:
     from uem_dolfinx.contact.laws.soft import Adhesion, Exponential, PowerLaw, SoftContact
     from uem_dolfinx.contact.laws.stribeck import Stribeck, Thirion, ViscousFriction
     from uem_dolfinx.contact.preload import Preload
-    from uem_dolfinx.decks.deck import Deck, read_deck
+    from uem_dolfinx.decks.deck import Deck
+    from uem_dolfinx.decks.reading import read_deck
     from uem_dolfinx.dynamics.inertia import Dynamics
     from uem_dolfinx.dynamics.mass import Mass, consistent_mass, lumped_mass, nodal_mass
     from uem_dolfinx.dynamics.scheme import CentralDifferences, Scheme, generalised_alpha, newmark
@@ -167,7 +168,7 @@ _LATER = {
     "Adhesion": "contact.laws.soft",
     "Leak": "contact.laws.leak",
     "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.cohesive", "Power": "contact.laws.cohesive",
-    "OfTemperature": "contact.laws.law", "read_mesh": "geometry.mesh_files", "read_deck": "decks.deck", "Deck": "decks.deck",
+    "OfTemperature": "contact.laws.law", "read_mesh": "geometry.mesh_files", "read_deck": "decks.reading", "Deck": "decks.deck",
     "CentralDifferences": "dynamics.scheme",
     "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",
     "lumped_mass": "dynamics.mass", "nodal_mass": "dynamics.mass",

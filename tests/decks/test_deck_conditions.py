@@ -9,7 +9,8 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from deck_scenes import columns, written
+import ufl
+from deck_scenes import columns, deck, grid, node_sets, written
 from helpers import refused
 
 import uem_dolfinx as uem
@@ -313,3 +314,16 @@ def test_direct_steps_of_heat(folder):
         taken = [float(deck._dt.value) for _ in deck.run()]
         assert sum(taken) == pytest.approx(1.0) and (len(set(np.round(taken, 9))) == 1) is bool(option)
         assert not option or len(taken) == 20
+
+
+@pytest.mark.parametrize(("kind", "n"), [("quad", 3), ("hexahedron", 8)])
+def test_forces_at_the_nodes_of_a_side(folder, kind, n):
+    """The work of the stresses in a stretch is that of the n forces of the file, none at nodes that complete its cells."""
+    x, name, cells = grid(kind, 2, 1)
+    sets = node_sets({"foot": np.flatnonzero(x[:, -1] == 0.0), "head": np.flatnonzero(x[:, -1] == 1.0)})
+    text = sets + STEEL.format(0.0).replace("body 1", name) + "*BOUNDARY\nfoot, 1, 3\n"
+    read = uem.read_deck(
+        deck(folder, "side.inp", x, {name: cells}, text + f"*STEP\n*STATIC\n*CLOAD\nhead, {x.shape[1]}, 0.5\n*END STEP\n"), COMM
+    )
+    list(read.run())
+    assert uem.integrate(E * read.u[x.shape[1] - 1].dx(x.shape[1] - 1) * ufl.dx) == pytest.approx(0.5 * n, rel=1e-8)

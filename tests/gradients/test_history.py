@@ -14,20 +14,19 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from gradient_scenes import DRAGGED, DRAGGED_MORTAR, changed, control_of, dot, drag_anew, dragged
+from gradient_scenes import DRAGGED, changed, control_of, dot, drag_anew, dragged
 from helpers import blocks, clamp, linear, modulus, refused, run, slow
 
 import uem_dolfinx as uem
 
 COMM = MPI.COMM_WORLD
-WAYS = [(*scene, "node_to_surface") for scene in DRAGGED] + [(*scene, "mortar") for scene in DRAGGED_MORTAR]
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize("cell, rigid, law, names, coupling", [WAYS[0], *(slow(*scene) for scene in WAYS[1:])])
-def test_of_second_order(cell, rigid, law, names, coupling):
+@pytest.mark.parametrize("cell, rigid, law, names, how", [DRAGGED[0], *(slow(*scene) for scene in DRAGGED[1:])])
+def test_of_second_order(cell, rigid, law, names, how):
     """``J(h) - J(0) - h J'`` vanishes with h^2 over all steps, for every kind of control, where the same contactors stick and slip."""
-    s = dragged(cell, rigid, law, coupling=coupling)
+    s = dragged(cell, rigid, law, **how)
     found, told = s.solve(), {}
     assert any(0 < stick < active for active, stick in found.states)
     for name, by in zip(names, found.history.gradient(s.J, [control_of(s, found.contact, name) for name in names])):

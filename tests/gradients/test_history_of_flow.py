@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from gradient_scenes import wave
 from helpers import at, box, refused, run, scene, slow
-from history_scenes import COMM, alone, bent, slope_alone, taylor
+from history_scenes import BACK_STRESSES, COMM, alone, bent, changes_of_flow, slope_alone, taylor
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.materials.back_stress import kinematic_return
 from uem_dolfinx.materials.finite_plasticity import VARYING
 from uem_dolfinx.materials.hardening import Linear, Saturating
 from uem_dolfinx.materials.logarithmic import logarithmic_return, to_components, to_tensors
 from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
-from uem_dolfinx.materials.return_slopes import logarithmic_back, plane_stress_back, radial_back
+from uem_dolfinx.materials.return_slopes import kinematic_back, logarithmic_back, plane_stress_back, radial_back
 
 SCENES = [
     {"kind": "plane_stress"},
@@ -28,19 +28,18 @@ SCENES = [
     slow({"cell": "hexahedron", "kind": "3d"}),
     slow({"law_of": uem.FinitePlasticity}),
     slow({"law_of": uem.FinitePlasticity, "cell": "hexahedron", "kind": "3d", "friction": 0.2}),
+    slow({"kind": "plane_stress", "moves": 10.0}),
+    slow({"moves": 10.0, "friction": 0.2}),
+    slow({"moves": BACK_STRESSES}),
+    slow({"law_of": uem.FinitePlasticity, "moves": 0.0}),
+    slow({"law_of": uem.FinitePlasticity, "moves": 10.0, "cell": "hexahedron", "kind": "3d", "friction": 0.2}),
+    slow({"law_of": uem.FinitePlasticity, "moves": BACK_STRESSES}),
 ]
 
 
 def changes(s):
     """Of all controls of a scene: what tells it, and a change."""
-    g = len(s.led.value)
-    some = [
-        (s.E, s.E, 20.0),
-        (s.nu, s.nu, 0.02),
-        (s.flow, s.flow, 0.04),
-        (s.hardening, s.hardening, wave(s.hardening.function_space, 2.0)),
-    ]
-    return [*some, (s.load, s.load, np.full(g, 0.02)), (s.led, s.led, np.full(g, 1e-3))]
+    return [(control, control, change) for control, change in changes_of_flow(s)]
 
 
 @pytest.mark.parametrize("how", SCENES)
@@ -102,32 +101,32 @@ def test_a_bar_that_flows():
 @pytest.mark.parametrize("k", [3, 4, 6])
 def test_slopes_of_returns(k):
     """Of every return by strain, history and parameters, where points flow and where they do not, against central differences."""
-    rng, n, none = np.random.default_rng(1), 40, np.zeros(40)
+    rng, n = np.random.default_rng(1), 40
     returned, back = (plane_stress_return, plane_stress_back) if k == 3 else (radial_return, radial_back)
     E, nu = 200.0 * (1.0 + rng.random(n)), np.full(n, 0.3)
     strain, plastic, deviatoric = rng.normal(size=(n, k)) * 2e-3, rng.normal(size=(n, k)) * 1e-3, rng.normal(size=(n, k)) * 1e-3
     if k > 3:
         plastic[:, :3] -= plastic[:, :3].mean(axis=1, keepdims=True)
         deviatoric[:, :3] -= deviatoric[:, :3].mean(axis=1, keepdims=True)
-    begin = [strain, plastic, rng.random(n) * 0.01, E, nu, np.full(n, 0.8), 15.0 * rng.random(n)]
+    begin = [strain, plastic, rng.random(n) * 0.01, E, nu, np.full(n, 0.8), 15.0 * rng.random(n), 9.0 * rng.random(n)]
     counts = rng.normal(size=(n, k)), rng.normal(size=(n, k)), rng.normal(size=n)
 
     def arguments(values):
         """Of a return."""
-        *state, E, nu, flow, hardening = values
-        return *state, *((E, nu) if k == 3 else (E / (2 * (1 + nu)),)), flow, hardening
+        *state, E, nu, flow, hardening, modulus = values
+        return *state, *((E, nu) if k == 3 else (E / (2 * (1 + nu)),)), flow, hardening, modulus
 
     def counted(values):
         """What counts after a return."""
-        found = returned(*arguments(values), none)
+        found = returned(*arguments(values))
         return (found.stress * counts[0] + found.plastic_strain * counts[1]).sum(axis=1) + found.peeq * counts[2]
 
-    flows = returned(*arguments(begin), none).peeq > begin[2]
+    flows = returned(*arguments(begin)).peeq > begin[2]
     assert 5 < flows.sum() < n - 5
     by = back(*arguments(begin), *counts)
     found = by.strain, by.plastic_strain, by.peeq, (by.shear + by.area) / E, by.area / (1 - nu) - by.shear / (1 + nu)
-    found = *found, by.yield_stress, by.hardening
-    sizes = rng.normal(size=(n, k)) * 1e-3, deviatoric, 0.01 * np.ones(n), 0.1 * E, 0.1 * nu, 0.1 * begin[5], begin[6]
+    found = *found, by.yield_stress, by.hardening, by.modulus
+    sizes = rng.normal(size=(n, k)) * 1e-3, deviatoric, 0.01 * np.ones(n), 0.1 * E, 0.1 * nu, 0.1 * begin[5], begin[6], begin[7]
     for i, change in enumerate(sizes):
         ends = [counted([*begin[:i], begin[i] + h * change, *begin[i + 1 :]]) for h in (-1e-5, 1e-5)]
         slope = (found[i] * change).reshape(n, -1).sum(axis=1)
@@ -136,28 +135,34 @@ def test_slopes_of_returns(k):
 
 @pytest.mark.parametrize("kind", ["plane_strain", "axisymmetric", "3d"])
 @pytest.mark.parametrize("curve", ["linear", "voce"])
-def test_slopes_of_the_return_in_finite_strain(kind, curve):
+@pytest.mark.parametrize("moves", [False, True])
+def test_slopes_of_the_return_in_finite_strain(kind, curve, moves):
     """By gradient, history and parameters, at strains of a third, against central differences."""
     rng, n = np.random.default_rng(2), 40
     varying, k = VARYING[kind], 6 if kind == "3d" else 4
     c = len(varying[0])
     flow, slope = 0.8 + 0.1 * rng.random(n), 15.0 * rng.random(n)
     counts = rng.normal(size=(n, c)), rng.normal(size=(n, k)), rng.normal(size=n)
-    before = to_tensors(rng.normal(size=(n, k)) * 0.05)
+    parts = rng.normal(size=(2, n, k)) * np.where(np.arange(n) < n // 2, 5e-4, 0.05)[:, None]
+    # flow keeps the volume, and so do the changes of what has flowed
+    metric, grows = np.eye(3) - 2 * to_tensors(parts[0]), to_tensors(parts[1])
+    metric /= np.linalg.det(metric)[:, None, None] ** (1 / 3)
+    grows -= np.trace(np.linalg.solve(metric, grows), axis1=1, axis2=2)[:, None, None] / 3 * metric
     begin = [
         rng.normal(size=(n, c)) * 0.1,
-        to_components(before, k),
+        to_components((np.eye(3) - metric) / 2, k),
         rng.random(n) * 0.01,
         77.0 * (1.0 + rng.random(n)),
         flow,
         slope,
+        20.0 * rng.random(n),
     ]
+    returned, back = (kinematic_return, kinematic_back) if moves else (logarithmic_return, logarithmic_back)
     begin[0][: n // 2] *= 0.01
-    begin[1][: n // 2] *= 0.01
 
     def arguments(values):
         """Of the return."""
-        moved, plastic, peeq, mu, flow, slope = values
+        moved, plastic, peeq, mu, flow, slope, modulus = values
         gradient = np.zeros((n, 3, 3))
         gradient[:, varying[0], varying[1]] = moved
         return (
@@ -166,24 +171,26 @@ def test_slopes_of_the_return_in_finite_strain(kind, curve):
             peeq,
             mu,
             Linear(flow, slope) if curve == "linear" else Saturating(flow, uem.Voce(0.5, 0.1, 2.0)),
+            *([modulus] if moves else []),
             varying,
         )
 
     def counted(values):
         """What counts after a return."""
-        found = logarithmic_return(*arguments(values))
+        found = returned(*arguments(values))
         return (
             (found.first_piola * counts[0]).sum(axis=1) + (found.plastic_strain * counts[1]).sum(axis=1) + found.peeq * counts[2]
         )
 
-    flows = logarithmic_return(*arguments(begin)).peeq > begin[2]
+    flows = returned(*arguments(begin)).peeq > begin[2]
     assert flows.any() and not flows.all()
-    by = logarithmic_back(*arguments(begin), *counts)
+    by = back(*arguments(begin), *counts)
     found = [by.strain, by.plastic_strain, by.peeq, by.shear / begin[3], by.yield_stress]
-    sizes = [rng.normal(size=(n, c)) * 0.1, rng.normal(size=(n, k)) * 0.1, 0.1 * np.ones(n), 0.1 * begin[3], 0.1 * flow]
-    if curve == "linear":
-        found, sizes = [*found, by.hardening], [*sizes, slope]
+    sizes = [rng.normal(size=(n, c)) * 0.1, to_components(grows, k), 0.1 * np.ones(n), 0.1 * begin[3], 0.1 * flow]
+    found, sizes = [*found, by.hardening, by.modulus], [*sizes, slope, begin[6]]
     for i, change in enumerate(sizes):
+        if i == 5 and curve == "voce":
+            continue
         ends = [counted([*begin[:i], begin[i] + h * change, *begin[i + 1 :]]) for h in (-1e-5, 1e-5)]
         told = (found[i] * change).reshape(n, -1).sum(axis=1)
         assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(told, rel=1e-6, abs=1e-6 * np.abs(told).max()), i
@@ -193,10 +200,9 @@ def test_what_is_refused():
     """Laws whose memory has no derivatives, and single states of those that have."""
     s = bent()
     v = ufl.TestFunction(s.V)
-    for kind in (uem.VonMises, uem.FinitePlasticity):
-        law = kind(s.u, 200.0, 0.3, 0.4, kinematic_hardening=1.0, kind="plane_strain")
-        problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
-        refused(uem.InputError, "without back stresses as law with history", uem.recording(problem).__enter__)
+    law = uem.VonMises(s.u, 200.0, 0.3, 0.4, kinematic_hardening=BACK_STRESSES, kind="plane_stress")
+    problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
+    refused(uem.InputError, "no table of back stresses in plane stress", uem.recording(problem).__enter__)
     law = uem.VonMises(s.u, s.E, 0.3, 0.4, kind="plane_strain")
     problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
     refused(uem.InputError, "take the steps within uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, s.E))

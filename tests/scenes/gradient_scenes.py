@@ -166,14 +166,14 @@ def orders(s, functional, *names):
     return told
 
 
-DRAGGED = [
+_BY_NODES = [
     ("triangle", None, "neo", ("friction", "X")),
     ("triangle", "plane", "linear", ("top", "full", "place")),
     ("tetrahedron", None, "linear", ("E", "friction")),
     ("hexahedron", "sphere", "linear", ("X", "place")),
 ]
 
-DRAGGED_MORTAR = [
+_BY_MORTAR = [
     ("triangle", None, "neo", ("friction", "X", "E", "top", "full")),
     ("quadrilateral", None, "linear", ("friction", "X", "E", "top", "full")),
     ("triangle", "plane", "linear", ("friction", "top", "full", "place")),
@@ -182,19 +182,30 @@ DRAGGED_MORTAR = [
     ("tetrahedron", "plane", "linear", ("friction", "X", "place", "top")),
 ]
 
+#: How blocks are dragged: cells, rigid target, law, controls, and all else.
+DRAGGED = [(*scene, {}) for scene in _BY_NODES] + [(*scene, {"coupling": "mortar"}) for scene in _BY_MORTAR]
+DRAGGED += [
+    ("triangle", None, "neo", ("friction", "E", "top"), {"ring": True}),
+    ("triangle", None, "neo", ("friction", "E", "top"), {"coupling": "mortar", "ring": True}),
+    ("triangle", "sphere", "neo", ("friction", "X", "place"), {"coupling": "mortar", "degree": 2}),
+]
 
-def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="node_to_surface"):
+
+def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="node_to_surface", degree=1, ring=False):
     """A block that is pressed onto another, or onto a rigid surface, and dragged over it in some steps: some contactors stick, others slip.
 
-    ``mu``: the coefficient of friction, or a function of a scalar space that returns a Function.
+    ``mu``: the coefficient of friction, or a function of a scalar space that returns a Function. ``ring``: of revolution, about an axis.
 
     ``solve()`` takes the steps anew with the present values of all that the solution depends on; ``values`` are those of the contact.
     """
-    b = blocks(comm, cell, *((3, 4) if cell in ("triangle", "quadrilateral") else (2, 3)), overhang=0.25)
+    b = blocks(comm, cell, *((3, 4) if cell in ("triangle", "quadrilateral") else (2, 3)), overhang=0.25, degree=degree)
     mesh, g, u, v = b.scene.mesh, b.gdim, b.u, ufl.TestFunction(b.V)
+    if ring:
+        mesh.geometry.x[:, 0] += 1.0
+        uem.axisymmetric(mesh)
     E, top, full = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.zeros(g)), fem.Constant(mesh, np.zeros(g))
     top.value[0], top.value[-1] = 0.03, -0.05
-    kind = "plane_strain" if g == 2 else "3d"
+    kind = "axisymmetric" if ring else "plane_strain" if g == 2 else "3d"
     material = uem.NeoHooke(E, 0.3, kind=kind) if law == "neo" else uem.LinearElastic(E, 0.3, kind=kind)
     F = material.residual(u, v) * ufl.dx - ufl.inner(full, v) * ufl.dx
     push = fem.dirichletbc(top, fem.locate_dofs_topological(b.V, g - 1, b.top.entities), b.V)
@@ -234,7 +245,8 @@ def control_of(s, contact, name):
 def changed(s, name):
     """A change of a control of a dragged scene."""
     g = s.b.gdim
-    changes = {"E": 1.0, "full": np.eye(g)[-1], "top": np.linspace(1.0, -1.0, g), "X": wave(s.b.V, 0.05), "friction": 1.0}
+    changes = {"E": 1.0, "full": np.eye(g)[-1], "top": np.linspace(1.0, -1.0, g), "friction": 1.0}
+    changes["X"] = wave(compat.function_space(s.b.scene.mesh, 1, (g,)), 0.05)
     return (changes | {"place": np.linspace(0.5, 1.0, g), "turn": 1.0 if g == 2 else np.linspace(0.5, 1.0, 3)})[name]
 
 

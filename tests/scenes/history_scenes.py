@@ -115,9 +115,15 @@ def taylor(s, changes, size=1e-3):
     return order, slope
 
 
-def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, steps=2, friction=0.0, law_of=uem.VonMises):
+BACK_STRESSES = [(0.0, 0.0), (0.005, 0.15), (0.02, 0.3)]
+
+
+def bent(
+    cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, steps=2, friction=0.0, law_of=uem.VonMises, moves=None
+):
     """A plastic block that is pressed against a rigid plane by its bottom, and goes back a little, in some steps each way.
 
+    ``moves`` is its kinematic hardening, or a table of back stresses, then without isotropic hardening.
     ``solve()`` makes the law anew with the present values of its parameters, and takes all steps.
     """
     g = 3 if cell == "hexahedron" else 2
@@ -128,6 +134,7 @@ def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, s
     E, nu, flow = (fem.Constant(mesh, value) for value in (200.0, 0.3, 0.4))
     hardening = fem.Function(compat.function_space(mesh, ("DG", 0)))
     hardening.interpolate(lambda x: 15.0 + 5.0 * x[0])
+    kinematic = fem.Constant(mesh, moves) if isinstance(moves, float) else moves or 0.0
     load, led = fem.Constant(mesh, np.full(g, 0.02)), fem.Constant(mesh, np.zeros(g))
     led.value[0], led.value[-1] = 0.004, 0.012
     w = fem.Function(V)
@@ -138,7 +145,8 @@ def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, s
         u.x.array[:] = 0.0
         way = np.array(led.value)
         how = {} if law_of is uem.FinitePlasticity else {"strain": strain}
-        law = law_of(u, E, nu, flow, hardening, kind=kind, **how)
+        isotropic = 0.0 if kinematic is BACK_STRESSES else hardening
+        law = law_of(u, E, nu, flow, isotropic, kinematic_hardening=kinematic, kind=kind, **how)
         F = law.residual(v) - ufl.inner(load, v) * ufl.dx
         contact = uem.Contact(top, uem.RigidPlane([0.0] * (g - 1) + [1.0], [0.0] * (g - 1) + [-1.0]), friction=friction)
         bcs = [fem.dirichletbc(led, fem.locate_dofs_topological(V, g - 1, bottom.entities), V)]
@@ -154,4 +162,15 @@ def bent(cell="quadrilateral", kind="plane_strain", strain="small", comm=COMM, s
         J = ufl.inner(u, u) * ufl.dx + ufl.replace(F, {v: w})
         return SimpleNamespace(problem=problem, history=history, contact=contact, states=states, J=J, law=law)
 
-    return SimpleNamespace(V=V, u=u, E=E, nu=nu, flow=flow, hardening=hardening, load=load, led=led, solve=solve)
+    return SimpleNamespace(
+        V=V, u=u, E=E, nu=nu, flow=flow, hardening=hardening, kinematic=kinematic, load=load, led=led, solve=solve
+    )
+
+
+def changes_of_flow(s):
+    """Changes of all controls of ``bent``."""
+    g = len(s.led.value)
+    some = [(s.E, 20.0), (s.nu, 0.02), (s.flow, 0.04), (s.load, np.full(g, 0.02)), (s.led, np.full(g, 1e-3))]
+    if s.kinematic is not BACK_STRESSES:
+        some.append((s.hardening, wave(s.hardening.function_space, 2.0)))
+    return [*some, (s.kinematic, 2.0)] if isinstance(s.kinematic, fem.Constant) else some

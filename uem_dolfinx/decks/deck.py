@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
@@ -23,17 +22,14 @@ from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.preload import Preload
-from uem_dolfinx.decks.model import model_of
-from uem_dolfinx.decks.parts import SAME_LENGTH, TEMPERATURE, Course, Interaction, Linear, Model, Pair, Step
+from uem_dolfinx.decks.parts import SAME_LENGTH, TEMPERATURE, Course, Interaction, Linear, Material, Model, Pair, Step
+from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.dynamics.mass import consistent_mass
-from uem_dolfinx.errors import InputError, MissingFileError, SpaceError, TagError
+from uem_dolfinx.dynamics.scheme import Scheme
+from uem_dolfinx.errors import InputError, SpaceError, TagError
 from uem_dolfinx.geometry.axisymmetry import axisymmetric
-from uem_dolfinx.geometry.cuts import BACK, RawMesh, cut
-from uem_dolfinx.geometry.decks import found_of, read_numbers
-from uem_dolfinx.geometry.gmsh import distributed
-from uem_dolfinx.geometry.mesh_files import raw_of
+from uem_dolfinx.geometry.cuts import BACK
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.log import logger
 from uem_dolfinx.materials.elastic import LinearElastic, StVenantKirchhoff
 from uem_dolfinx.output.xdmf import geometry_degree
 from uem_dolfinx.parallel import reduced
@@ -43,6 +39,8 @@ from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
 from uem_dolfinx.solve.steps.stages import Step as OfUsers
+from uem_dolfinx.solve.steps.time_step import TimeStep
+from uem_dolfinx.solve.steps.time_steps import time_steps
 
 #: Kinds of strains by the first letters of element types.
 STRAINS_OF_TYPES = {"C3D": "3d", "CPE": "plane_strain", "CPS": "plane_stress", "CAX": "axisymmetric"}
@@ -92,6 +90,7 @@ class Deck(given.Sealed):
         self.sections = {name: self._section(name, node, axis) for name, node, axis in model.pretension}
         held = dict.fromkeys(where for step in model.steps for where in step.held if not self._is_reference(where[0]))
         self._bcs = {where: self._condition(where) for where in held}
+        dynamics = self._dynamics(V)
         self.problem = UnitedProblem(
             self._residual(),
             self.u,
@@ -101,6 +100,8 @@ class Deck(given.Sealed):
             equations=[self._equation(one) for one in model.equations],
             points=self._point_loads(),
             couplings=[self._rigid(*one) for one in model.rigid],
+            dynamics=dynamics,
+            load=None if dynamics is None else self._load_at,
         )
 
     def __repr__(self) -> str:
@@ -110,8 +111,12 @@ class Deck(given.Sealed):
 
     # -- for users -------------------------------------------------------------------------------------------------------
 
-    def run(self) -> Iterator[LoadStep]:
+    def run(self) -> Iterator[LoadStep | TimeStep]:
         """Take all steps, one converged load step or step of time after the other (collective); errors as of ``load_steps``."""
+        for k, step in enumerate(self.steps if self.problem.dynamics is not None else ()):
+            yield from time_steps(self.problem, step.first, float(self._ends[k]))
+        if self.problem.dynamics is not None:
+            return
         yield from load_steps(self.problem, [one for k, step in enumerate(self.steps) for one in self._stages(k, step)])
 
     def modes(self) -> Vibrations:
@@ -204,6 +209,48 @@ class Deck(given.Sealed):
                 driven[...] = before + share * (now - before)
 
         return loads
+
+    @property
+    def _ends(self) -> Array:
+        """Times at the ends of the steps."""
+        return np.cumsum([step.duration for step in self.steps])
+
+    def _load_at(self, time: float) -> None:
+        """Set the loads of a time of a motion, in full from the beginning of their step."""
+        k = int(np.searchsorted(self._ends[:-1] * (1.0 + SAME_LENGTH), time))
+        since = time - (self._ends[k] - self.steps[k].duration)
+        self._loads(k, 1.0, since, since)(0.0)
+
+    def _dynamics(self, V: fem.FunctionSpace) -> Dynamics | None:
+        """Mass, damping and velocities of ``*DYNAMIC``; InputError for other steps, or for what changes between these (collective)."""
+        first = self.steps[0]
+        if all(step.kind != "DYNAMIC" for step in self.steps):
+            return None
+        same = [(step.kind, step.alpha, set(step.held), step.contacts, step.friction) for step in self.steps]
+        if any(one != ("DYNAMIC", first.alpha, set(first.held), {}, {}) for one in same):
+            raise InputError(
+                "*DYNAMIC among steps of other kinds, with another ALPHA, or with conditions, contacts or friction that change: expected "
+                "*DYNAMIC steps alone, whose loads and values may change"
+            )
+        rho, velocity, test = self._density("a motion needs"), fem.Function(V), ufl.TestFunction(V)
+        for (name, dof), value in self._model.velocities.items():
+            compat.set_bc_values(velocity.x.array, [dirichlet(V, self._tag(name), dof - 1, value)])
+        velocity.x.scatter_forward()
+        damps = any(any(one.damping) for one in self._model.materials.values())
+
+        def damping(rate: Any) -> ufl.Form:
+            F = 0
+            for material, cells in self._bodies():
+                alpha, beta = material.damping
+                F += alpha * rho * ufl.inner(rate, test) * cells if alpha else 0
+                assert material.elastic is not None
+                stiff = LinearElastic(*material.elastic, kind=self._kind)  # type: ignore[arg-type]
+                F += beta * stiff.residual(rate, test) * cells if beta else 0
+            return F
+
+        a = first.alpha
+        scheme = Scheme((1.0 - a) ** 2 / 4, 0.5 - a, 0.0, -a)
+        return Dynamics(consistent_mass(V, rho), scheme=scheme, velocity=velocity, damping=damping if damps else None)
 
     def _drive(self, driven: Array, values: list[Any]) -> None:
         """Let an array follow values at the ends of the steps."""
@@ -306,6 +353,11 @@ class Deck(given.Sealed):
 
     # -- the form --------------------------------------------------------------------------------------------------------
 
+    def _bodies(self) -> Iterator[tuple[Material, ufl.Measure]]:
+        """Materials, each with its cells."""
+        for elements, name in self._model.sections:
+            yield self._model.materials[name], dx(self._tag(elements)) if len(self._model.sections) > 1 else ufl.dx
+
     def _residual(self) -> ufl.Form:
         """Internal minus external virtual work of all sections, with their heat."""
         thermal, test = self._model.thermal, ufl.TestFunction(self.u.function_space)
@@ -313,10 +365,9 @@ class Deck(given.Sealed):
         v, q = ufl.split(test) if thermal else (test, None)
         law_of = StVenantKirchhoff if any(step.nlgeom for step in self.steps) else LinearElastic
         F, heating = 0, self._heating(T)
-        for elements, name in self._model.sections:
-            material, cells = self._model.materials[name], dx(self._tag(elements)) if len(self._model.sections) > 1 else ufl.dx
+        for material, cells in self._bodies():
             if material.elastic is None:
-                raise InputError(f"material '{name}' has no *ELASTIC: expected E and nu of an isotropic material")
+                raise InputError(f"material '{material.name}' has no *ELASTIC: expected E and nu of an isotropic material")
             law = law_of(*material.elastic, kind=self._kind)  # type: ignore[arg-type]
             F += law.residual(w, v) * cells
             if material.expansion and heating is not None:
@@ -391,56 +442,3 @@ class Deck(given.Sealed):
             with suppress(SpaceError):
                 field.x.array[compat.bc_dofs(dirichlet(field.function_space, self._tag(name)))[0]] = value
         field.x.scatter_forward()
-
-
-def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
-    """Read a deck of Abaqus or CalculiX with its materials, conditions, contacts, steps and loads as a problem (collective).
-
-    Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
-    ``*BOUNDARY``, ``*CLOAD``, pressures, ``GRAV`` and ``CENTRIF`` by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``,
-    ``*CONTACT PAIR``, ``*TIE``, ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of
-    contact pairs, ``*RIGID BODY`` and ``*PRE-TENSION SECTION``, whose surface is cut; values that follow an ``*AMPLITUDE``, or are in
-    the directions of a ``*TRANSFORM``; steps ``*STATIC``, ``*HEAT TRANSFER``, ``*COUPLED TEMPERATURE-DISPLACEMENT`` and
-    ``*FREQUENCY``. Cells of several kinds, prisms and pyramids are divided into simplices.
-    All else is in ``left_out`` and in the log.
-
-    Args:
-        path: of the input file.
-        comm: communicator of the mesh; rank 0 reads the file.
-        soft: False takes surfaces as hard, since most decks mean the slopes of ``PRESSURE-OVERCLOSURE`` as penalties; True takes these
-            laws as they stand, as ``SoftContact``, but for contacts with friction.
-
-    Raises:
-        InputError, InputTypeError: for an argument of another type, or a keyword that cannot be read.
-        MissingFileError, MeshError, TagError: without the file, for a mesh that cannot be read, or a set without nodes of a body.
-    """
-    given.kind("path", path, isinstance(path, str | Path), "the path of an input file")
-    given.kind("comm", comm, isinstance(comm, MPI.Comm), "an MPI communicator", "as MPI.COMM_WORLD")
-    given.flag("soft", soft)
-    file, kept = Path(path).expanduser().absolute(), dict[str, Any]()
-
-    def read() -> RawMesh:
-        if not file.is_file():
-            raise MissingFileError(f"input file {path} does not exist")
-        numbers = read_numbers(file)
-        kept["model"] = model_of(numbers)
-        found = found_of(numbers, file)
-        # sections and ties may join kinds of cells, of which a mesh has one
-        kinds = {block.base for block in found.bodies}
-        several = len(kinds) != 1 or kinds <= {"wedge", "pyramid"}
-        if several:
-            kept["model"].left_out.append(f"{', '.join(sorted(kinds))}: divided into triangles or tetrahedra")
-        raw = raw_of(found, file, simplices=several)
-        for surface, *_ in kept["model"].pretension:
-            raw = cut(raw, surface)
-        nodes = np.array(sorted(numbers.nodes), dtype=np.int64)
-        assert raw.of_file is not None
-        # nodes in the middle of cells that were made complete have no number
-        kept["numbers"] = np.where(raw.of_file < len(nodes), nodes[np.minimum(raw.of_file, len(nodes) - 1)], -1)
-        return raw
-
-    mesh, tags = distributed(comm, read, path)
-    deck = Deck(mesh, tags, comm.bcast(kept.get("model"), root=0), kept.get("numbers"), soft)
-    if deck.left_out and comm.rank == 0:
-        logger.warning("%s: without counterpart, or taken otherwise: %s", path, "; ".join(deck.left_out))
-    return deck

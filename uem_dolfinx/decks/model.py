@@ -46,7 +46,7 @@ KNOWN_OPTIONS = {
     "DSLOAD": "OP AMPLITUDE", "AMPLITUDE": "NAME TIME",
     "RIGID BODY": "NSET ELSET REF_NODE ROT_NODE", "TRANSFORM": "NSET TYPE", "TEMPERATURE": "OP",
     "MODEL CHANGE": "TYPE ADD REMOVE", "CHANGE FRICTION": "INTERACTION", "STATIC": "SOLVER DIRECT",
-    "HEAT TRANSFER": "SOLVER DIRECT STEADY_STATE",
+    "HEAT TRANSFER": "SOLVER DIRECT STEADY_STATE", "DYNAMIC": "SOLVER DIRECT ALPHA", "DAMPING": "ALPHA BETA",
     "COUPLED TEMPERATURE-DISPLACEMENT": "SOLVER DIRECT STEADY_STATE",
 }  # fmt: skip
 
@@ -69,6 +69,7 @@ class _Reader:
             "MATERIAL": self._of_material, "ELASTIC": self._elastic, "DENSITY": self._number("density"),
             "EXPANSION": self._number("expansion"), "CONDUCTIVITY": self._number("conductivity"),
             "SPECIFIC HEAT": self._number("heat_capacity"), "SOLID SECTION": self._section,
+            "DAMPING": self._damping,
             "SURFACE INTERACTION": self._of_interaction, "SURFACE BEHAVIOR": self._behaviour, "FRICTION": self._friction,
             "GAP CONDUCTANCE": self._conductance, "CONTACT PAIR": self._pair, "TIE": self._tie, "EQUATION": self._equation,
             "PRE-TENSION SECTION": self._pretension, "INITIAL CONDITIONS": self._initial, "STEP": self._new_step,
@@ -91,6 +92,9 @@ class _Reader:
             duration = times[1] or 1.0
             self._step.kind, self._step.first, self._step.duration = keyword, times[0] or duration, duration
             self._step.steady, self._step.direct = "STEADY STATE" in options, "DIRECT" in options
+            self._step.alpha = float(options.get("ALPHA", self._step.alpha))
+            if "EXPLICIT" in options:
+                raise InputError("EXPLICIT: expected implicit steps of time")
             self.model.steps.append(self._step)
             return True
         reader = self._readers.get(keyword)
@@ -99,7 +103,8 @@ class _Reader:
     # -- materials and interactions --------------------------------------------------------------------------------------
 
     def _of_material(self, options: dict[str, str], rows: list[list[str]]) -> None:
-        self._material = self.model.materials.setdefault(options["NAME"].upper(), Material())
+        name = options["NAME"].upper()
+        self._material = self.model.materials.setdefault(name, Material(name))
 
     def _elastic(self, options: dict[str, str], rows: list[list[str]]) -> bool:
         _isotropic(options)
@@ -114,6 +119,9 @@ class _Reader:
             return len(rows) == 1
 
         return read
+
+    def _damping(self, options: dict[str, str], rows: list[list[str]]) -> None:
+        self._material.damping = float(options.get("ALPHA", 0.0)), float(options.get("BETA", 0.0))
 
     def _section(self, options: dict[str, str], rows: list[list[str]]) -> None:
         plane = any(name.startswith(("CPS", "CPE")) for name in self.model.types)
@@ -184,10 +192,11 @@ class _Reader:
         self.model.pretension.append((options["SURFACE"], options["NODE"], _numbers(rows[0])[:3] if rows else []))
 
     def _initial(self, options: dict[str, str], rows: list[list[str]]) -> bool:
-        if options["TYPE"].upper() != "TEMPERATURE":
-            return False
-        _last(self.model.initial, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
-        return True
+        if (kind := options["TYPE"].upper()) == "VELOCITY":
+            self.model.velocities |= {(node_of(self._deck, row[0]), int(row[1])): _numbers(row[2:])[0] for row in rows}
+        elif kind == "TEMPERATURE":
+            _last(self.model.initial, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
+        return kind in ("VELOCITY", "TEMPERATURE")
 
     def _rigid(self, options: dict[str, str], rows: list[list[str]]) -> None:
         at = int(options["REF NODE"])

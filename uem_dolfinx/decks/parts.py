@@ -13,7 +13,7 @@ from uem_dolfinx.contact.laws.soft import Exponential, SoftContact
 from uem_dolfinx.errors import InputError
 
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
-STEP_KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True}
+STEP_KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True, "DYNAMIC": False}
 #: Number of the temperature among the degrees of freedom.
 #: [format; number; -]
 TEMPERATURE = 11
@@ -111,11 +111,14 @@ class BodyLoad:
 class Material:
     """Numbers of a material; None are not given."""
 
+    name: str = ""
     elastic: tuple[float, float] | None = None
     density: float = 0.0
     expansion: float = 0.0
     conductivity: float | None = None
     heat_capacity: float = 0.0
+    #: Parts of mass and of stiffness that damp.
+    damping: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass
@@ -166,6 +169,7 @@ class Step:
     """A step: its kind, times, and all conditions and loads that act in it, with their values at its end.
 
     Attributes:
+        alpha: of the Hilber-Hughes-Taylor method, in ``*DYNAMIC``.
         friction: coefficients that change, by the names of interactions.
         motions: values of ``held`` and ``forces`` at reference nodes of rigid bodies, by these words, node and degree of freedom.
     """
@@ -176,6 +180,7 @@ class Step:
     duration: float = 1.0
     steady: bool = False
     direct: bool = False
+    alpha: float = -0.05
     held: dict[Where, Value] = field(default_factory=dict)
     forces: dict[Where, Value] = field(default_factory=dict)
     pressures: dict[Where, Value] = field(default_factory=dict)
@@ -204,6 +209,7 @@ class Model:
         thickness: of plane bodies.
         equations: linear equations among nodes.
         initial: temperatures at the start, by set or node.
+        velocities: at the start, by set or node, and degree of freedom.
         rigid: set, position, and nodes of translation and rotation of each rigid body.
         pretension: surface, reference node and axis of each section of a bolt.
         modes: number of vibrations that are wanted after the last step; 0 for none.
@@ -218,6 +224,7 @@ class Model:
     pairs: list[Pair] = field(default_factory=list)
     equations: list[Linear] = field(default_factory=list)
     initial: dict[str, float] = field(default_factory=dict)
+    velocities: dict[tuple[str, int], float] = field(default_factory=dict)
     rigid: list[tuple[str, list[float], int, int]] = field(default_factory=list)
     pretension: list[tuple[str, str, list[float]]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)

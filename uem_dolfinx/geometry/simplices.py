@@ -168,7 +168,8 @@ SERENDIPITY = {"quad8": "quad9", "hexahedron20": "hexahedron27", "wedge15": "wed
 def completed(found: Found) -> tuple[Found, int]:
     """The mesh with complete cells in place of serendipity cells, and the number of added nodes.
 
-    Cells that share a quadrilateral share its new node. Sets with all nodes of a quadrilateral or hexahedron get its new node.
+    Cells that share a quadrilateral share its new node. Sets with all nodes of a quadrilateral or hexahedron get its new node, but for
+    sets of single points.
     """
     asked = [block for block in found.cells if block.type in SERENDIPITY]
     if not asked:
@@ -195,7 +196,9 @@ def completed(found: Found) -> tuple[Found, int]:
                 count += n
             block = replace(block, type=SERENDIPITY[block.type], data=np.concatenate(data, axis=1))
         cells.append(block)
-    sets = {name: _with_new(nodes, count, around) for name, nodes in found.point_sets.items()}
+    sets = {
+        name: nodes if name in found.as_points else _with_new(nodes, count, around) for name, nodes in found.point_sets.items()
+    }
     return replace(found, points=np.concatenate(points), cells=cells, point_sets=sets), count - len(x)
 
 

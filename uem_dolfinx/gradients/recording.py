@@ -41,8 +41,8 @@ def recording(
     the residual.
 
     Args:
-        problem: in statics or in time; supported are Coulomb friction on cells of degree 1 with sliding='finite', and ``VonMises`` or
-            ``FinitePlasticity`` without back stresses as law with history.
+        problem: in statics or in time; supported are Coulomb friction with sliding='finite', at degree 2 in 2D and with mortar only, and
+            ``VonMises`` or ``FinitePlasticity`` as law with history, but no table of back stresses in plane stress.
         scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
         controls: of the derivatives that are wanted later, if known: those without derivatives are refused before the first step.
 
@@ -75,7 +75,7 @@ def recording(
             if not getattr(material, "has_slopes", False):
                 raise InputError(
                     f"a history has no derivatives through what {type(material).__name__} remembers: expected VonMises "
-                    "or FinitePlasticity without back stresses as law with history; else take differences of runs"
+                    "or FinitePlasticity, with no table of back stresses in plane stress; else take differences of runs"
                 )
         try:
             history = History(problem, None if scratch is None else Path(scratch))
@@ -104,13 +104,13 @@ def _check_friction(problem: UnitedProblem, contact: Any) -> None:
     """Refuse contacts with friction whose history has no derivatives."""
     pair, law, config = contact.pair, as_law(contact.friction), problem.config
     means = pair.whole.kinematics
-    mortar = isinstance(means, MortarKinematics) and not (config.axisymmetric or means.of.elimination.seam.any)
+    mortar = isinstance(means, MortarKinematics)
     for wrong, expected in (
         (
-            not (pair.discretisation.traits.pointwise or mortar),
-            "coupling='node_to_surface', and 'mortar' without an axis of revolution or periodic surfaces",
+            not (mortar or pair.discretisation.traits.pointwise) or (mortar and means.of.elimination.seam.any),
+            "coupling='node_to_surface', and 'mortar' without periodic surfaces, where contactors have one displacement",
         ),
-        (config.degree > 1, "cells of degree 1"),
+        (config.degree > 1 and not (mortar and config.gdim == 2), "cells of degree 1, and in 2D degree 2 with coupling='mortar'"),
         (contact.sliding != "finite", "sliding='finite'"),
         (contact.normals != "facet", "normals='facet'"),
         (type(law) is not Coulomb or law.per_area or law.per_point or follows_load(law), "Coulomb's law, without limit or load"),

@@ -33,7 +33,7 @@ from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.gradients.adjoint import Adjoint
 from uem_dolfinx.gradients.anchor_slopes import AnchorSlopes
 from uem_dolfinx.gradients.assemblies import Users, by_section, section_of
-from uem_dolfinx.gradients.derivatives import Derivatives, transposed
+from uem_dolfinx.gradients.derivatives import Derivatives, Places, transposed
 from uem_dolfinx.gradients.gradient import AnyControl
 from uem_dolfinx.gradients.linearised import Linearised
 from uem_dolfinx.gradients.mean_slopes import MeanSlopes
@@ -171,8 +171,10 @@ class Sweep:
             if isinstance(m, ContactParameter):
                 self._add(k, _left_behind(problem, m, self._by_anchors, slopes, True))
             elif isinstance(m, ufl.SpatialCoordinate):
-                self.found[k].x.array[: handed.size] += handed.ravel()
-                self.found[k].x.scatter_forward()
+                by = fem.Function(problem.config.V)
+                by.x.array[: handed.size] = handed.ravel()
+                by.x.scatter_forward()
+                self._add(k, Places(problem.config).back(by))
 
     def accelerate(self, start: Record) -> None:
         """Add derivatives by the first acceleration and velocity, with the problem set to the start (collective).

@@ -44,7 +44,7 @@ def kinematic_return(
     C, committed = F.transpose(0, 2, 1) @ F, one - 2 * to_tensors(plastic_strain)
     i = np.flatnonzero(np.isfinite(C).all(axis=(1, 2)))
     i = i[np.linalg.det(F[i]) > 0]
-    points = _Points(i, C[i], committed[i], mu[i], modulus[i], peeq[i])
+    points = Points(i, C[i], committed[i], mu[i], modulus[i], peeq[i])
     # F_p^-1 up to a rotation, which has no effect
     L = np.linalg.cholesky(committed[i])
     driving = points.driving(L)
@@ -70,7 +70,7 @@ def kinematic_return(
     return replace(flowed, tangent=tangent, energy=flowed.energy + modulus / 3 * (strains**2).sum(axis=1))
 
 
-def _minimised(points: _Points, curve: YieldCurve, L: Array) -> Array:
+def _minimised(points: Points, curve: YieldCurve, L: Array) -> Array:
     """Factors of ``C_p^-1`` at the minimum of the potential, by Newton's method; NaN without convergence ``(m, 3, 3)``.
 
     The iteration ends with steps below a part of the strains, or at rounding: small steps that no longer decrease.
@@ -93,16 +93,27 @@ def _minimised(points: _Points, curve: YieldCurve, L: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Step:
-    """Derivatives of the potential of a step at m points: by further flow ``(m, 6)`` and ``(m, 6, 6)``, with a term for the volume."""
+    """Derivatives of the potential of a step at m points: by further flow ``(m, 6)`` and ``(m, 6, 6)``, with a term for the volume.
+
+    With elastic and plastic strains ``(m, 6)``, the flow of length 1 and its length, the yield stress and its slope.
+    """
 
     slope: Array
     hessian: Array
     peeq: Array
-    size: Array
+    elastic: Array
+    plastic: Array
+    flow: tuple[Array, Array]
+    curve: tuple[Array, Array]
+
+    @property
+    def size(self) -> Array:
+        """Norm of the elastic strain and of the flow ``(m,)``."""
+        return np.asarray(np.linalg.norm(self.elastic, axis=1) + self.flow[1])
 
 
 @dataclass(frozen=True)
-class _Points:
+class Points:
     """The potential of a step at m points as a function of a factor L of ``C_p^-1 = L L^T``.
 
     Flow by a deviator S changes L to ``L exp(-S)``. It changes the elastic strain ``E = ln(L^T C L) / 2`` by ``-K(E) S``, the plastic
@@ -123,9 +134,9 @@ class _Points:
     modulus: Array
     peeq: Array
 
-    def some(self, k: Ints) -> _Points:
+    def some(self, k: Ints) -> Points:
         """The points with these numbers."""
-        return _Points(*(getattr(self, field.name)[k] for field in fields(self)))
+        return Points(*(getattr(self, field.name)[k] for field in fields(self)))
 
     def _elastic(self, L: Array) -> _Strain:
         return _Strain.of(L.transpose(0, 2, 1) @ self.C @ L)
@@ -135,6 +146,10 @@ class _Points:
         back = np.asarray(np.linalg.inv(L), dtype=np.float64)
         return _Strain.of(back @ since @ back.transpose(0, 2, 1))
 
+    def flowed(self, L: Array) -> _Strain:
+        """Plastic strain of the step."""
+        return self._plastic(L, self.committed)
+
     def driving(self, L: Array) -> Array:
         """Deviator of the stress minus the back stress ``(m, 3, 3)``."""
         E, A = self._elastic(L).tensor, self._plastic(L, np.eye(3)).tensor
@@ -143,19 +158,19 @@ class _Points:
 
     def step(self, L: Array, curve: YieldCurve) -> _Step:
         """Derivatives of the potential by flow from L."""
-        E, A, D = self._elastic(L), self._plastic(L, np.eye(3)), self._plastic(L, self.committed)
+        E, A, D = self._elastic(L), self._plastic(L, np.eye(3)), self.flowed(L)
         elastic, plastic, flow = (to_components(strain.tensor, 6) for strain in (E, A, D))
         length = np.linalg.norm(flow, axis=1)
         peeq = self.peeq + np.sqrt(2 / 3) * length
         stress, hardening = curve.at(peeq, self.i)
         along, force = flow / length[:, None], np.sqrt(2 / 3) * stress
         stiff, back_stiff = 2 * self.mu, 2 / 3 * self.modulus
-        slope = _NO_VOLUME @ (back_stiff[:, None] * plastic - stiff[:, None] * elastic + force[:, None] * along).T
+        slope = NO_VOLUME @ (back_stiff[:, None] * plastic - stiff[:, None] * elastic + force[:, None] * along).T
         line = along[:, :, None] * along[:, None, :]
-        hessian = stiff[:, None, None] * (_NO_VOLUME @ E.curvature @ _NO_VOLUME + _VOLUME)
+        hessian = stiff[:, None, None] * (NO_VOLUME @ E.curvature @ NO_VOLUME + _VOLUME)
         hessian += back_stiff[:, None, None] * A.curvature + (force / length)[:, None, None] * (D.curvature - line)
         hessian += (2 / 3 * hardening)[:, None, None] * line
-        return _Step(slope.T, hessian, peeq, np.linalg.norm(elastic, axis=1) + length)
+        return _Step(slope.T, hessian, peeq, elastic, plastic, (along, length), (stress, hardening))
 
     def mixed(self, L: Array, F: Array, components: Sequence[Ints]) -> Array:
         """Derivative of the slope by components of F ``(m, 6, c)``."""
@@ -167,7 +182,7 @@ class _Points:
         change = E.divided * (change + change.swapaxes(-1, -2)) / 2
         change = E.axes @ change @ E.axes.transpose(0, 2, 1)
         by = to_components(change.reshape(-1, 3, 3), 6).reshape(len(components[0]), -1, 6)
-        return -2 * self.mu[:, None, None] * (_NO_VOLUME @ by.transpose(1, 2, 0))
+        return -2 * self.mu[:, None, None] * (NO_VOLUME @ by.transpose(1, 2, 0))
 
 
 @dataclass(frozen=True)
@@ -197,7 +212,7 @@ class _Strain:
 
     @property
     def curvature(self) -> Array:
-        """K, see ``_Points`` ``(m, 6, 6)``."""
+        """K, see ``Points`` ``(m, 6, 6)``."""
         rows, columns = SYMMETRIC_COMPONENTS[6]
         h = self.values[:, rows] - self.values[:, columns]
         weights = np.where(h == 0, 1.0, h / np.tanh(np.where(h == 0, 1.0, h)))
@@ -210,7 +225,7 @@ class _Strain:
 #: Projections of the components of symmetric tensors onto the volumetric part and onto deviators.
 #: [format; components; -]
 _VOLUME = np.outer([1, 1, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0]) / 3
-_NO_VOLUME = np.eye(6) - _VOLUME
+NO_VOLUME = np.eye(6) - _VOLUME
 
 
 def _exponential(A: Array) -> Array:

@@ -186,7 +186,7 @@ class FinitePlasticity(VonMises):
         """Stress at the present displacement, from the committed history; NotFiniteError if it is not finite (collective)."""
         with timed("return mapping"):
             with np.errstate(over="ignore", invalid="ignore"):
-                flowed = self._return(self._gradients(), *self._committed())
+                flowed = self._flowed()
                 logarithm = self._volume_changes() @ self._spread.T
                 stress = flowed.stress.copy()
                 stress[:, :3] += (self._bulk[:, None] * logarithm).reshape(-1, 1)
@@ -203,9 +203,17 @@ class FinitePlasticity(VonMises):
         gradient[:, varying[0], varying[1]] = values
         return gradient
 
+    @property
+    def _moves(self) -> bool:
+        """Whether the yield surface moves, or there are derivatives by how it does."""
+        return bool(self._modulus.any()) or isinstance(self.handed["kinematic_hardening"], fem.Constant | fem.Function)
+
     def begins_with(self) -> tuple[Any, ...]:
         """Initial values of the return at the present displacement: gradient, committed history and parameters, in its order."""
-        return self._gradients(), *self._committed(), self._mu, self._curve, VARYING[self.kind]
+        begin, varying = (self._gradients(), *self._committed(), self._mu), VARYING[self.kind]
+        if self._layers is not None:
+            return *begin, varying
+        return *begin, self._curve, *([self._modulus] if self._moves else []), varying
 
     @property
     def stress_in_forms(self) -> fem.Function:
@@ -213,9 +221,14 @@ class FinitePlasticity(VonMises):
         return self._piola
 
     def _slopes_of_return(self) -> tuple[Callable[[Any], Any], Callable[..., ByReturn]]:
-        from uem_dolfinx.materials.return_slopes import logarithmic_back
+        from uem_dolfinx.materials.return_slopes import kinematic_back, logarithmic_back
 
-        return lambda w: self._components(self._part(w)), logarithmic_back
+        back: Callable[..., ByReturn] = logarithmic_back
+        if self._layers is not None:
+            back = self._layers.logarithmic_back
+        elif self._moves:
+            back = kinematic_back
+        return lambda w: self._components(self._part(w)), back
 
     def differentiate(self) -> None:
         """The tangent at the displacement of the last ``update``."""
@@ -226,15 +239,14 @@ class FinitePlasticity(VonMises):
             self._points.write(self._upper, self._trial.tangent()[:, rows, columns])
             self._differentiated = True
 
-    def _return(self, gradient: Array, plastic_strain: Array, peeq: Array) -> Flowed:
-        before, varying = (gradient, plastic_strain, peeq, self._mu), VARYING[self.kind]
+    def _flowed(self) -> Flowed:
         if self._layers is not None:
-            return self._layers.logarithmic_return(*before, varying)
-        if not self._modulus.any():
-            return logarithmic_return(*before, self._curve, varying)
+            return self._layers.logarithmic_return(*self.begins_with())
+        if not self._moves:
+            return logarithmic_return(*self.begins_with())
         from uem_dolfinx.materials.back_stress import kinematic_return
 
-        return kinematic_return(*before, self._curve, self._modulus, varying)
+        return kinematic_return(*self.begins_with())
 
     def _plastic_strains(self) -> Array:
         """Committed ``ln(C_p) / 2`` ``(n_points, size)``."""

@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from uem_dolfinx.errors import InputError
 from uem_dolfinx.materials.hardening import Linear, read_pairs
 from uem_dolfinx.materials.logarithmic import Flowed, logarithmic_return
 from uem_dolfinx.materials.return_mapping import MAX_STEPS, RETURNED, Returned, radial_return
+
+if TYPE_CHECKING:
+    from uem_dolfinx.materials.return_slopes import ByReturn
 
 #: Slopes of a table that differ by less than this part are one straight line.
 #: [convention; slope; test_tabulated_back_stress.py::test_points_on_a_straight_line]
@@ -72,10 +76,12 @@ class Layers:
     Attributes:
         weights: fractions of the body, of sum 1 ``(n, j)``.
         curve: yield stresses ``(n j,)``.
+        strains: plastic strains of the table ``(j,)``.
     """
 
     weights: Array
     curve: Linear
+    strains: Array
 
     @staticmethod
     def of(table: BackTable, yield_stress: Array, mu: Array) -> Layers:
@@ -83,7 +89,7 @@ class Layers:
         stiff = 3 * mu[:, None]
         parts = stiff / (stiff + table.slopes)
         stresses = (yield_stress[:, None] + table.stresses + stiff * table.strains).ravel()
-        return Layers(np.diff(parts, axis=1, prepend=0.0), Linear(stresses, np.zeros_like(stresses)))
+        return Layers(np.diff(parts, axis=1, prepend=0.0), Linear(stresses, np.zeros_like(stresses)), table.strains)
 
     @property
     def count(self) -> int:
@@ -115,6 +121,36 @@ class Layers:
         m = (np.sqrt(self.weights).reshape(-1, 1) * each.m).reshape(len(strain), self.count * strain.shape[1])
         stress, a, c, energy = (self.mean(values) for values in (each.stress, each.a, each.c, each.energy))
         return Returned(stress, each.plastic_strain, each.peeq, a, c, m, energy)
+
+    def radial_back(self, strain: Array, plastic_strain: Array, peeq: Array, mu: Array, *by: Array) -> ByReturn:
+        """Derivatives of ``radial_return``, whose arguments come first, as of ``return_slopes.radial_back``."""
+        from uem_dolfinx.materials.return_slopes import radial_back
+
+        none = np.zeros_like(peeq)
+        begin = self.repeat(strain), plastic_strain, peeq, self.repeat(mu), self.curve.yield_stress, none, none
+        return self._summed(radial_return(*begin).stress, partial(radial_back, *begin), mu, *by)
+
+    def logarithmic_back(
+        self, gradient: Array, plastic_strain: Array, peeq: Array, mu: Array, components: Sequence[Ints], *by: Array
+    ) -> ByReturn:
+        """Derivatives of ``logarithmic_return``, whose arguments come first, as of ``logarithmic_slopes.logarithmic_back``."""
+        from uem_dolfinx.materials.return_slopes import logarithmic_back
+
+        begin = self.repeat(gradient), plastic_strain, peeq, self.repeat(mu), self.curve, components
+        return self._summed(logarithmic_return(*begin).first_piola, partial(logarithmic_back, *begin), mu, *by)
+
+    def _summed(self, stress: Array, back: Callable[..., ByReturn], mu: Array, by_stress: Array, *by_history: Array) -> ByReturn:
+        """Derivatives for the body from those of layers; their weights and yield stresses depend on mu, too."""
+        from uem_dolfinx.materials.return_slopes import ByReturn
+
+        each = back(self.weights.reshape(-1, 1) * self.repeat(by_stress), *by_history)
+        n, j = self.weights.shape
+        strain, shear, flow = (values.reshape(n, j, *values.shape[1:]) for values in (each.strain, each.shear, each.yield_stress))
+        work = np.einsum("njk,nk->nj", stress.reshape(n, j, by_stress.shape[1]), by_stress)
+        parts = np.cumsum(self.weights, axis=1)
+        grown = np.diff(parts * (1 - parts), axis=1, prepend=0.0)
+        none, by_shear = 0.0 * mu, (shear + grown * work).sum(axis=1) + 3 * mu * (flow @ self.strains)
+        return ByReturn(strain.sum(axis=1), each.plastic_strain, each.peeq, by_shear, none, flow.sum(axis=1), none, none)
 
     def plane_stress_return(self, strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array) -> Returned:
         """Return of all layers with the same out-of-plane strain, for which the body's out-of-plane stress is zero.

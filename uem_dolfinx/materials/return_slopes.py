@@ -20,7 +20,7 @@ Derivatives by fields at quadrature points are densities: per volume of the poin
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,8 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.materials.hardening import YieldCurve
+from uem_dolfinx.materials.back_stress import NO_VOLUME, Points, kinematic_return
+from uem_dolfinx.materials.hardening import Linear, YieldCurve
 from uem_dolfinx.materials.logarithmic import logarithm_slope, to_components, to_tensors
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints
 from uem_dolfinx.materials.return_mapping import MODES, ON_SURFACE, plane_mises, plane_stress_return
@@ -45,6 +46,7 @@ class ByReturn:
         peeq: committed ``(n,)``.
         shear, area: by the logarithms of E / (1 + nu), and in plane stress of E / (1 - nu) ``(n,)``.
         yield_stress, hardening: ``(n,)``.
+        modulus: by the increase of the back stress per plastic strain ``(n,)``.
     """
 
     strain: Array
@@ -54,32 +56,36 @@ class ByReturn:
     area: Array
     yield_stress: Array
     hardening: Array
+    modulus: Array
 
 
 def radial_back(
-    strain: Array, plastic_strain: Array, peeq: Array, mu: Array, yield_stress: Array, hardening: Array,
+    strain: Array, plastic_strain: Array, peeq: Array, mu: Array, yield_stress: Array, hardening: Array, modulus: Array,
     by_stress: Array, by_plastic_strain: Array, by_peeq: Array,
 ) -> ByReturn:  # fmt: skip
     """Derivatives of ``radial_return``, whose arguments come first.
 
-    With the trial deviator t, ``q = |t| sqrt(3/2)``, ``N = t / q`` and ``dp = (q - flow) / (3 mu + H)`` a yielding point has
+    With the trial deviator t, ``o = t - 2/3 K E_p``, ``q = |o| sqrt(3/2)``, ``N = o / q`` and ``dp = (q - flow) / (3 mu + H + K)`` a
+    yielding point has
 
         s = t - 3 mu dp N,    E_p + 3/2 dp N,    peeq + dp
     """
     t = strain - plastic_strain
     t[:, :3] -= t[:, :3].mean(axis=1, keepdims=True)
     t *= 2 * mu[:, None]
-    q = np.sqrt(1.5) * np.linalg.norm(t, axis=1)
+    over = t - 2 / 3 * modulus[:, None] * plastic_strain
+    q = np.sqrt(1.5) * np.linalg.norm(over, axis=1)
     flow = yield_stress + hardening * peeq
     i = np.flatnonzero(q > (1 + ON_SURFACE) * flow)
-    by_t, of_dp = by_stress.copy(), np.zeros_like(q)
-    stiff, N = 3 * mu[i] + hardening[i], t[i] / q[i, None]
+    by_over, of_dp = np.zeros_like(t), np.zeros_like(q)
+    stiff, N = 3 * mu[i] + hardening[i] + modulus[i], over[i] / q[i, None]
     dp = (q[i] - flow[i]) / stiff
     by_flow = 1.5 * by_plastic_strain[i] - 3 * mu[i, None] * by_stress[i]
     along = (by_flow * N).sum(axis=1)
     of_dp[i] = along + by_peeq[i]
     turned = (dp / q[i])[:, None] * (by_flow - 1.5 * along[:, None] * N)
-    by_t[i] += (1.5 * of_dp[i] / stiff)[:, None] * N + turned
+    by_over[i] = (1.5 * of_dp[i] / stiff)[:, None] * N + turned
+    by_t = by_stress + by_over
     by_shear = (by_t * t).sum(axis=1)
     by_shear[i] -= 3 * mu[i] * dp * ((by_stress[i] * N).sum(axis=1) + of_dp[i] / stiff)
     by_t[:, :3] -= by_t[:, :3].mean(axis=1, keepdims=True)
@@ -87,48 +93,58 @@ def radial_back(
     by_yield, by_hardening = np.zeros_like(q), np.zeros_like(q)
     by_yield[i] = -of_dp[i] / stiff
     by_hardening[i] = by_yield[i] * (peeq[i] + dp)
+    by_modulus = -2 / 3 * (by_over * plastic_strain).sum(axis=1)
+    by_modulus[i] += by_yield[i] * dp
     return ByReturn(
-        by_strain, by_plastic_strain - by_strain, by_peeq + hardening * by_yield, by_shear, 0.0 * q, by_yield, by_hardening
-    )
+        by_strain, by_plastic_strain - by_strain - 2 / 3 * modulus[:, None] * by_over, by_peeq + hardening * by_yield, by_shear,
+        0.0 * q, by_yield, by_hardening, by_modulus,
+    )  # fmt: skip
 
 
 def plane_stress_back(
-    strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array, yield_stress: Array, hardening: Array,
+    strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array, yield_stress: Array, hardening: Array, modulus: Array,
     by_stress: Array, by_plastic_strain: Array, by_peeq: Array,
 ) -> ByReturn:  # fmt: skip
     """Of ``plane_stress_return``, whose arguments come first, with its modes m, its unknown x and ``h(x) = 0`` differentiated."""
     shear, area = E / (1 + nu), E / (1 - nu)
-    C = np.stack([area, shear, shear])
-    m = MODES @ (strain - plastic_strain).T * C
-    flow = yield_stress + hardening * peeq
-    i = np.flatnonzero(plane_mises(m[0] ** 2, m[1] ** 2 + m[2] ** 2) > (1 + ON_SURFACE) * flow)
-    by_m = MODES @ by_stress.T
+    C, third = np.stack([area, shear, shear]), np.array([[3.0], [1.0], [1.0]])
+    m, flowed = MODES @ (strain - plastic_strain).T * C, third * (MODES @ plastic_strain.T)
+    flow, over = yield_stress + hardening * peeq, m - 2 / 3 * modulus * flowed
+    i = np.flatnonzero(plane_mises(over[0] ** 2, over[1] ** 2 + over[2] ** 2) > (1 + ON_SURFACE) * flow)
+    by_m, by_over = MODES @ by_stress.T, np.zeros_like(m)
     by_yield, by_hardening = np.zeros_like(E), np.zeros_like(E)
-    b, H, r, third = shear[i], hardening[i], (area / shear)[i] / 3, np.array([[3.0], [1.0], [1.0]])
-    after = plane_stress_return(strain, plastic_strain, peeq, E, nu, yield_stress, hardening, np.zeros_like(E))
-    t, e = MODES @ after.stress[i].T, MODES @ by_plastic_strain[i].T
-    q = plane_mises(t[0] ** 2, t[1] ** 2 + t[2] ** 2)
+    b, H, r, k = shear[i], hardening[i], (area / shear)[i] / 3, (2 / 3 * modulus / shear)[i]
+    after = plane_stress_return(strain, plastic_strain, peeq, E, nu, yield_stress, hardening, modulus)
+    e = MODES @ by_plastic_strain[i].T
+    # the differences from the back stress are on the yield surface
+    q = flow[i] + H * (after.peeq[i] - peeq[i])
     x = 1.5 * b * (after.peeq[i] - peeq[i]) / q
-    y, z = 1 / (1 + r * x), 1 / (1 + x)
+    y, z = 1 / (1 + (r + k) * x), 1 / (1 + (1 + k) * x)
     shrunk, slope = np.stack([y, z, z]), 2 * H / (3 * b)
+    t, moved = shrunk * over[:, i], (1 + k * x) * by_m[:, i]
     of_q = np.stack([0.5 * t[0], 1.5 * t[1], 1.5 * t[2]]) / q
-    flowed = (t / third * e).sum(axis=0) / b
-    by_t = by_m[:, i] + x / b * e / third + by_peeq[i] * x / (1.5 * b) * of_q
-    t_x = -np.stack([r * y, z, z]) * t
-    by_x = flowed + by_peeq[i] * q / (1.5 * b) + (by_t * t_x).sum(axis=0)
+    by_flow = (t / third * e).sum(axis=0) / b
+    by_t = moved + x / b * e / third + by_peeq[i] * x / (1.5 * b) * of_q
+    t_x = -np.stack([(r + k) * y, (1 + k) * z, (1 + k) * z]) * t
+    along = (by_m[:, i] * t).sum(axis=0)
+    by_x = k * along + by_flow + by_peeq[i] * q / (1.5 * b) + (by_t * t_x).sum(axis=0)
     h_x = slope - flow[i] / q**2 * (of_q * t_x).sum(axis=0)
     root = by_x / h_x
     by_t = by_t + root * flow[i] / q**2 * of_q
-    by_m[:, i] = shrunk * by_t
+    by_over[:, i] = shrunk * by_t - by_m[:, i]
+    by_m = by_m + by_over
     by_yield[i] = -root / q
     by_hardening[i] = by_yield[i] * peeq[i] - root * 2 * x / (3 * b)
     by_area, by_shear = by_m[0] * m[0], (by_m[1:] * m[1:]).sum(axis=0)
-    of_ratio = -r * x * y * t[0] * by_t[0]
+    of_ratio, of_k = -r * x * y * t[0] * by_t[0], x * (along - (by_t * shrunk * t).sum(axis=0))
     by_area[i] += of_ratio
-    by_shear[i] += root * slope * x - x * flowed - by_peeq[i] * x * q / (1.5 * b) - of_ratio
+    by_shear[i] += root * slope * x - x * by_flow - by_peeq[i] * x * q / (1.5 * b) - of_ratio - k * of_k
+    by_modulus = -2 / 3 * (by_over * flowed).sum(axis=0)
+    by_modulus[i] += 2 / 3 * of_k / b
     by_strain = (MODES.T @ (C * by_m)).T
+    by_plastic_strain = by_plastic_strain - by_strain - (MODES.T @ (2 / 3 * modulus * third * by_over)).T
     return ByReturn(
-        by_strain, by_plastic_strain - by_strain, by_peeq + hardening * by_yield, by_shear, by_area, by_yield, by_hardening
+        by_strain, by_plastic_strain, by_peeq + hardening * by_yield, by_shear, by_area, by_yield, by_hardening, by_modulus
     )
 
 
@@ -190,8 +206,48 @@ def logarithmic_back(
     flow = np.where(yields, -root, 0.0)
     return ByReturn(
         of_gradient[:, components[0], components[1]], to_components(-2 * of_metric, size), by_peeq + slope * flow, by_mu * mu, 0.0 * mu,
-        flow, flow * (peeq + dp),
+        flow, flow * (peeq + dp), 0.0 * mu,
     )  # fmt: skip
+
+
+def kinematic_back(
+    gradient: Array, plastic_strain: Array, peeq: Array, mu: Array, curve: YieldCurve, modulus: Array, components: Sequence[Ints],
+    by_stress: Array, by_plastic_strain: Array, by_peeq: Array,
+) -> ByReturn:  # fmt: skip
+    """Derivatives of ``kinematic_return``, whose arguments come first, as of ``logarithmic_back``.
+
+    At the minimum the slope g of the potential by further flow S vanishes, so that ``S' = -H^-1 dg`` with its second derivative H. The
+    stress is elastic at the new plastic strain, ``E_p' = L S L^T``.
+    """
+    done = kinematic_return(gradient, plastic_strain, peeq, mu, curve, modulus, components)
+    elastic = Linear(np.full(len(mu), np.inf), np.zeros(len(mu)))
+    by = logarithmic_back(
+        gradient, done.plastic_strain, done.peeq, mu, elastic, components, by_stress, by_plastic_strain, by_peeq
+    )
+    i, one = np.flatnonzero(done.peeq > peeq), np.eye(3)
+    F, L = gradient[i] + one, np.asarray(np.linalg.cholesky(one - 2 * to_tensors(done.plastic_strain[i])), dtype=np.float64)
+    points = Points(i, F.transpose(0, 2, 1) @ F, one - 2 * to_tensors(plastic_strain[i]), mu[i], modulus[i], peeq[i])
+    step, D, root = points.step(L, curve), points.flowed(L), np.sqrt(2 / 3)
+    (along, length), (stress, hardening) = step.flow, step.curve
+    longer = root * by_peeq[i, None] * along
+    load = to_components(L.transpose(0, 2, 1) @ to_tensors(by.plastic_strain[i]) @ L, 6) + longer
+    z = -np.asarray(np.linalg.solve(step.hessian, (load @ NO_VOLUME)[:, :, None])[:, :, 0])
+    of_stress = root * (z * along).sum(axis=1)
+    # by the plastic strain of the step, and through it by the committed one
+    across = z - (z * along).sum(axis=1)[:, None] * along
+    by_flow = (root * stress / length)[:, None] * across + (root * hardening * of_stress)[:, None] * along + longer
+    back = D.axes.transpose(0, 2, 1) @ np.linalg.inv(L)
+    by_committed = D.divided * (D.axes.transpose(0, 2, 1) @ to_tensors(by_flow) @ D.axes)
+    by_committed = -back.transpose(0, 2, 1) @ by_committed @ back
+    found = {field.name: np.array(getattr(by, field.name)) for field in fields(by)}
+    found["strain"][i] += np.einsum("ms,msc->mc", z, points.mixed(L, F, components))
+    found["plastic_strain"][i] = to_components(by_committed, plastic_strain.shape[1])
+    found["peeq"][i] += hardening * of_stress
+    found["shear"][i] -= 2 * mu[i] * ((z @ NO_VOLUME) * step.elastic).sum(axis=1)
+    found["yield_stress"][i] = of_stress
+    found["hardening"][i] = of_stress * step.peeq
+    found["modulus"][i] = 2 / 3 * ((z @ NO_VOLUME) * step.plastic).sum(axis=1)
+    return ByReturn(**found)
 
 
 def _in_axes(axes: Array, A: Array) -> Array:
@@ -227,8 +283,8 @@ class PlasticSlopes:
         n = points.volumes.size
         self._by_stress = np.zeros((n, size))
         #: Derivatives by plastic strain and peeq at the end of the step, after ``pass_back`` at its beginning; forwards their changes.
-        self._by_history = np.zeros((n, law.plastic_strain.function_space.dofmap.index_map_bs)), np.zeros(n)
-        self._state: tuple[Array, ...] = ()
+        self._by_history: tuple[Array, ...] = tuple(np.zeros_like(values) for values in law.begins_with()[1:3])
+        self._state: tuple[Any, ...] = ()
 
     def begin(self, by_stress: Array | None) -> None:
         """Begin a step, with the law set to its end.
@@ -274,6 +330,7 @@ class PlasticSlopes:
             "nu": by.area / (1 - nu) - by.shear / (1 + nu),
             "yield_stress": by.yield_stress,
             "hardening": by.hardening,
+            "kinematic_hardening": by.modulus,
         }
         # of the bulk modulus, E / 3 / (1 - 2 nu)
         rates = {"E": 1 / E, "nu": 2 / (1 - 2 * nu)}
@@ -305,9 +362,9 @@ class PlasticChanges(PlasticSlopes):
         """
         self._state = self._law.begins_with()
         n, k = self._by_stress.shape
-        m = k + self._by_history[0].shape[1] + 1
+        m = k + sum(f.function_space.dofmap.index_map_bs for f in (self._law.plastic_strain, self._law.peeq))
         units = np.broadcast_to(np.eye(m)[:, None], (m, n, m))
-        self._rows = [self._back(*self._state, unit[:, :k], unit[:, k:-1], unit[:, -1]) for unit in units]
+        self._rows = [self._back(*self._state, *self._parted(unit)) for unit in units]
         changes, known = {name: np.zeros(n) for name in self._law.handed}, self._law.parameters
         for name, value in self._law.handed.items():
             for m, change in direction:
@@ -318,7 +375,8 @@ class PlasticChanges(PlasticSlopes):
         logs = E - nu / (1 + known["nu"]), E + nu / (1 - known["nu"]), E + 2 * nu / (1 - 2 * known["nu"])
         self._explicit = np.stack(
             [
-                row.shear * logs[0] + row.area * logs[1] + row.yield_stress * changes["yield_stress"] + row.hardening * changes["hardening"]
+                row.shear * logs[0] + row.area * logs[1] + row.yield_stress * changes["yield_stress"]
+                + row.hardening * changes["hardening"] + row.modulus * changes["kinematic_hardening"]
                 for row in self._rows
             ]
         )  # fmt: skip
@@ -331,13 +389,22 @@ class PlasticChanges(PlasticSlopes):
 
     def end(self) -> None:
         """End the step, with a, the change of the displacement (collective)."""
-        found, k = self._after(self._points.evaluate(self._along_a)), self._by_stress.shape[1]
-        self._by_history = found[:, k:-1], found[:, -1]
+        self._by_history = self._parted(self._after(self._points.evaluate(self._along_a)))[1:]
+
+    def _parted(self, values: Array) -> tuple[Array, Array, Array]:
+        """Values of stress, plastic strain and peeq side by side ``(n, m)``, in their shapes; layers are points of their own."""
+        plastic, peeq = self._by_history
+        k, j = self._by_stress.shape[1], self._law.peeq.function_space.dofmap.index_map_bs
+        return values[:, :k], values[:, k:-j].reshape(plastic.shape), values[:, -j:].reshape(peeq.shape)
 
     def _after(self, strain: Array) -> Array:
         """Changes of stress, plastic strain and peeq after the return, with a change of the strain, side by side."""
         plastic, peeq = self._by_history
-        parts = [(row.strain * strain + row.plastic_strain * plastic).sum(axis=1) + row.peeq * peeq for row in self._rows]
+        n, j = len(strain), self._law.peeq.function_space.dofmap.index_map_bs
+        parts = []
+        for row in self._rows:
+            of_layers = (row.plastic_strain * plastic).sum(axis=1) + row.peeq * peeq
+            parts.append((row.strain * strain).sum(axis=1) + of_layers.reshape(n, j).sum(axis=1))
         return np.asarray((np.stack(parts) + self._explicit).T)
 
     def _at_points(self, m: Any, change: Any) -> Array:

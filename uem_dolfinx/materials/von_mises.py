@@ -130,6 +130,7 @@ class VonMises(given.Sealed):
         degrees = self._degrees(degree, quadrature_degree)
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, one) for one in degrees)
         self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
+        self.handed["kinematic_hardening"] = kinematic_hardening
         self._told = self.handed | {"cells": cells}
         #: Yield stress over peeq; with a table, the yield curve of the layers.
         self._curve: YieldCurve
@@ -331,13 +332,10 @@ class VonMises(given.Sealed):
 
     def _returned(self) -> Returned:
         """Stress, history and tangent at the present displacement, from the committed history."""
-        plane, begin, layers = self.kind == "plane_stress", self.begins_with(), self._layers
-        returned: Callable[..., Returned] = plane_stress_return if plane else radial_return
-        if layers is None:
-            return returned(*begin, self._modulus)
-        returned = layers.plane_stress_return if plane else layers.radial_return
-        # yield stresses are data of the layers
-        return returned(*begin[: -len(self._curve.parameters)])
+        plane, of = self.kind == "plane_stress", self._layers
+        radial: Callable[..., Returned] = radial_return if of is None else of.radial_return
+        flat: Callable[..., Returned] = plane_stress_return if of is None else of.plane_stress_return
+        return (flat if plane else radial)(*self.begins_with())
 
     def _committed(self) -> tuple[Array, Array]:
         """Plastic strain ``(n, k)`` and peeq ``(n,)`` of all points, with layers one after another."""
@@ -350,13 +348,14 @@ class VonMises(given.Sealed):
 
     @property
     def has_slopes(self) -> bool:
-        """Whether gradients through histories are available: without back stresses, at this rank's points."""
-        return self._layers is None and not self._modulus.any()
+        """Whether gradients through histories are available: not with a table of back stresses in plane stress."""
+        return self._layers is None or self.kind != "plane_stress"
 
-    def begins_with(self) -> tuple[Array, ...]:
+    def begins_with(self) -> tuple[Any, ...]:
         """Initial values of the return at the present displacement: strain, committed history and parameters, in its order."""
-        elastic = (self._E, self._nu) if self.kind == "plane_stress" else (self._mu,)
-        return self._points.evaluate(self._strain), *self._committed(), *elastic, *self._curve.parameters.values()
+        elastic = [self._E, self._nu] if self.kind == "plane_stress" else [self._mu]
+        begin = self._points.evaluate(self._strain), *self._committed(), *elastic
+        return begin if self._layers is not None else (*begin, *self._curve.parameters.values(), self._modulus)
 
     @property
     def stress_in_forms(self) -> fem.Function:
@@ -374,7 +373,8 @@ class VonMises(given.Sealed):
         """Strain along a displacement, and derivatives of the return."""
         from uem_dolfinx.materials.return_slopes import plane_stress_back, radial_back
 
-        return lambda w: self._vector(self._variation(w)), plane_stress_back if self.kind == "plane_stress" else radial_back
+        radial: Callable[..., ByReturn] = radial_back if self._layers is None else self._layers.radial_back
+        return lambda w: self._vector(self._variation(w)), plane_stress_back if self.kind == "plane_stress" else radial
 
     def _refuse_infinite(self, stress: Array) -> None:
         """NotFiniteError on all ranks if a stress at this rank's points ``(n_points, size)`` is not finite (collective)."""

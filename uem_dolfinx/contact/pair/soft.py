@@ -63,7 +63,9 @@ def traction_by_gaps(pair: Interface, multipliers: Array) -> Traction:
     """Contact forces of multipliers ``(n,)`` of the rows of all gaps, without those along further axes of corners (collective)."""
     every = np.ones(len(pair.nodes), dtype=bool)
     rows = pair.kinematics.gap_rows.select(np.arange(len(every)), every)
-    return pair.kinematics.forces(replace(pair.trial, active=every), rows, np.where(rows.normal, multipliers[rows.contactor], 0.0))
+    return pair.kinematics.forces(
+        replace(pair.trial, active=every), rows, np.where(rows.normal, multipliers[rows.contactor], 0.0)
+    )
 
 
 class _Edges:
