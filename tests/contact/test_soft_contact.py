@@ -253,6 +253,30 @@ def test_a_run_that_goes_on(folder):
     assert rest == pytest.approx(whole[2:], rel=1e-9)
 
 
+@pytest.mark.parametrize("general", [True, slow(False)])
+def test_damped_surfaces_that_are_far_apart_at_first(general, folder):
+    """The flight before does not change how a damped block meets another, and a run that stops on the way goes on as the whole one."""
+
+    def fallen(gap, n, stop=None):
+        b = blocks(COMM, "quadrilateral", 2, 3, gap=gap)
+        normal = uem.SoftContact(20.0, damping=2.0)
+        contact = uem.GeneralContact(normal=normal) if general else uem.Contact(b.high, b.low, normal=normal)
+        velocity = fem.Function(b.V)
+        velocity.x.array[1::2] = np.where(b.V.tabulate_dof_coordinates()[:, 1] > 0.5 * gap, -1.0, 0.0)
+        dynamics = uem.Dynamics(uem.lumped_mass(b.V, 1.0), velocity=velocity, contactors="massy")
+        problem = uem.UnitedProblem(linear(b.u, 10.0), b.u, bcs=clamp(b.V, b.bottom), contacts=[contact], dynamics=dynamics)
+        for step in uem.time_steps(problem, 0.1, 0.1 * n, checkpoint=stop and uem.Checkpoint(folder / "run.npz")):
+            if step.number == stop:
+                break
+        return b.scene.gather(b.u) + np.where(b.scene.drawing[:, 1:] > 0.5 * gap, [[0.0, gap]], 0.0)
+
+    whole = fallen(0.8, 12)
+    fallen(0.8, 12, stop=3)
+    assert np.abs(fallen(0.8, 12, stop=99) - whole).max() < 1e-12
+    near = fallen(0.1, 5)
+    assert np.abs(near - whole).max() < 1e-6 * np.abs(whole).max()
+
+
 @pytest.mark.parametrize("general", [False, slow(True)])
 def test_contactors_over_edges_of_tetrahedra(general):
     """Contactors that alternate between two facets of a bending surface get averaged normals, and a step ends."""

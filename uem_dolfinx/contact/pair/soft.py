@@ -107,7 +107,9 @@ class SoftInterface(Interface):
             # also at corners of bodies in general contact: those opposite do not press
             self.discretisation.follow_by(_Edges())
         n = len(self.nodes)
-        self.trial = self.committed = replace(self.committed, law_gap=np.full(n, np.inf))
+        # surfaces that are far apart at the start have a state of damping, too
+        damping = np.tile([np.inf, 0.0, np.inf, 0.0, float(contact._at)], (n, 1)) if law.damping else None
+        self.trial = self.committed = replace(self.committed, law_gap=np.full(n, np.inf), damping=damping)
         #: Gaps at which the law gives the forces, multipliers and stiffnesses of the rows there, areas, and contactors whose gap is held
         #: ``(n,)``.
         self._at = self._multipliers = self._stiffness = self._area = np.zeros(n)
