@@ -143,6 +143,9 @@ def test_rigid_surfaces(cell, mu):
         on = general.between(touch.second, "body 1")
         assert np.abs(on.force + touch.force).max() < 1e-15 and on.normal == pytest.approx(contact.resultant().normal, rel=1e-10)
     assert general.resultant().normal == pytest.approx(sum(c.resultant().normal for c in declared), rel=1e-10)
+    assert general.dissipation == pytest.approx(sum(c.dissipation for c in declared), rel=1e-8) and (
+        general.dissipation > 0.0
+    ) == (mu > 0.0)
 
 
 # -- what is told ------------------------------------------------------------------------------------------------------------

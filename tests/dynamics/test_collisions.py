@@ -199,6 +199,37 @@ def test_corners_beside_the_end_are_no_blow(wider):
     assert landing.contacts[0].n_active == 0 and COMM.allreduce(int(landing.problem.pairs[0].trial.barred.sum())) == 0
 
 
+@pytest.mark.parametrize(("contactors", "n", "named"), [("massy", 2, 1), pytest.param("massless", 6, 2, marks=pytest.mark.slow)])
+def test_corners_that_come_back_below_the_target_are_left_out(contactors, n, named, caplog):
+    """A block that has passed the end moves back below the target's face: no contact throws it up, and each corner is named once."""
+    depth, speed = 0.02, 1e-2
+    bodies = [box("quadrilateral", [x, y - 1.0], [x + 1.0, y], [n, n]) for x, y in ((0.0, 0.0), (1.05, 1.0 - depth))]
+    s = scene(COMM, "quadrilateral", bodies)
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v, velocity = fem.Function(V), ufl.TestFunction(V), fem.Function(V)
+    velocity.x.array.reshape(-1, 2)[np.unique(compat.cell_dofs(V)[s.body == 1]), 0] = -speed
+    law = uem.LinearElastic(1.0, 0.0, kind="plane_stress")
+    contact = uem.Contact(s.tag("block", 1, at(1, -depth)), s.tag("ledge", 0, at(1, 0.0)), max_penetration=1.0)
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), velocity=velocity, contactors=contactors)
+    problem = uem.UnitedProblem(
+        law.residual(u, v) * ufl.dx,
+        u,
+        bcs=clamp(V, s.tag("ground", 0, at(1, -1.0))),
+        contacts=[contact],
+        dynamics=dynamics,
+        rtol=1e-11,
+    )
+    book = uem.EnergyBook(problem, law.energy(u) * ufl.dx)
+    with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
+        for step in uem.time_steps(problem, 0.07 / n / speed, 0.3 / speed):
+            book.write(step)
+    energy = np.array([row.kinetic + row.stored for row in book.rows])
+    assert np.abs(energy / energy[0] - 1.0).max() <= 1e-11 and contact.n_active == 0
+    assert COMM.allreduce(int(problem.pairs[0].trial.barred.sum())) == named
+    told = [record for record in caplog.records if "slid past the end" in record.getMessage()]
+    assert COMM.rank != 0 or sum(int(re.search(r": (\d+) contactors", record.getMessage())[1]) for record in told) == named
+
+
 def test_both_sides_are_massless_where_bodies_can_carry_it(caplog):
     """A rod of one layer of elements keeps the mass of its surface; a stiffer contactor on it is warned of, a softer one is not."""
 

@@ -167,6 +167,16 @@ class AddedMass:
         self.acceleration = self._carried(acceleration)
         self.forces = self.masses[:, None] * self.acceleration
 
+    def take_out(self, acceleration: Array, part: float) -> Array:
+        """Take ``part`` of an acceleration of the nodes ``(n_owned, gdim)`` and its inertia forces out of the committed ones (collective).
+
+        Returns:
+            Those inertia forces at the owned nodes of the set ``(n, gdim)``.
+        """
+        inertia = self.masses[:, None] * (a := self._carried(acceleration))
+        self.acceleration, self.forces = self.acceleration - part * a, self.forces - inertia
+        return self.nodal_forces(inertia)
+
     def commit(self) -> None:
         """Commit the rates and forces of the present displacement (collective)."""
         now, self.carried = self._now(), self.loads()

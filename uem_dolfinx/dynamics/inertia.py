@@ -25,7 +25,7 @@ from uem_dolfinx.dynamics.scheme import CentralDifferences, Scheme, newmark
 from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.log import logger, timed
+from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
 if TYPE_CHECKING:
@@ -47,7 +47,8 @@ class Dynamics(given.Sealed):
         damping: function of the velocity, a UFL expression, that returns a form, linear in the test function, to add to the residual:
             ``lambda rate: eta * ufl.inner(ufl.sym(ufl.grad(rate)), ufl.sym(ufl.grad(v))) * ufl.dx``.
         contactors: ``"massless"`` moves the mass of the contactors to neighbouring nodes [UEM, 5], and also of the target nodes below
-            them in bodies with fine meshes; impact itself then neither dissipates nor adds energy. ``"massy"`` does not move mass.
+            them in bodies with fine meshes; impact itself then neither dissipates nor adds energy. ``"massy"`` does not move mass:
+            contact acts for whole steps, and a touch takes the energy of the masses that it stops.
         time: at the start.
 
     Attributes:
@@ -186,23 +187,15 @@ class Dynamics(given.Sealed):
         self.held = held.ravel()
 
     def make_contactors_massless(self, contacts: Sequence[Contact]) -> None:
-        """Redistribute the mass of contact surfaces by ``massless.without_surfaces``, or warn that contactors have mass (collective).
+        """Redistribute the mass of contact surfaces by ``massless.without_surfaces``, unless they keep it (collective).
 
         Raises:
             MassError: if the other nodes of a body cannot take the mass of its contactors.
         """
-        from uem_dolfinx.dynamics.massless import contactor_nodes, without_surfaces
+        from uem_dolfinx.dynamics.massless import without_surfaces
 
-        contactors = contactor_nodes(contacts)
-        massy = int(reduced(self.config.comm, int((self.mass.of_nodes[contactors] > 0).any(axis=1).sum())))
         if self.contactors == "massless":
             self.mass = without_surfaces(self.mass, contacts)
-        elif massy and isinstance(self.scheme, Scheme):
-            logger.warning(
-                "%d contactors have mass: impact will set them in vibration, and the trapezoidal rule then adds energy at every touch; "
-                "contactors='massless' avoids both",
-                massy,
-            )
         self.massy = self.mass.of_nodes > 0
         self._weight = forms.product(
             self.mass.M, self.mass.config.vector(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
@@ -393,13 +386,16 @@ class Dynamics(given.Sealed):
         """Set velocity and acceleration of free components at the end of the present explicit step, before its ``commit`` ``(n,)``."""
         self._v_rate, self._v_past[: self._n], self._a_past[: self._n] = 0.0, velocity, acceleration
 
-    def change_rates(self, velocity: Array, acceleration: Array) -> None:
-        """Replace velocity and acceleration of free components of the committed state, at the same momentum ``(n,)`` (collective)."""
+    def change_rates(self, velocity: Array, acceleration: Array, part: float = 1.0) -> None:
+        """Replace velocity and acceleration of free components of the committed state ``(n,)`` (collective).
+
+        Accelerations change by this ``part`` of what balances the change of the inertia forces.
+        """
         n, free = self._n, ~self.held
         change = np.where(free, acceleration - self.acceleration.x.array[:n], 0.0)
         self.velocity.x.array[:n] = np.where(free, velocity, self.velocity.x.array[:n])
         self.acceleration.x.array[:n] += change
-        self.forces.x.array[:n] += forms.product(self.mass.M, self.mass.config.vector(change)).array_r
+        self.forces.x.array[:n] += forms.product(self.mass.M, self.mass.config.vector(change)).array_r / part
         for field in (self.forces, self.acceleration, self.velocity):
             field.x.scatter_forward()
         self._copy_committed()

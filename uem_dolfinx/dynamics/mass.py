@@ -249,7 +249,7 @@ class Mass:
             f"{contactors:.0f} contactors: its other {others:.0f} nodes with mass are too few, or too close to each other; "
             f"{part}refine the mesh behind its contact surface, to five layers of cells of degree 1, or between two contactor surfaces to "
             "seven (six with a lumped mass), declare fewer facets as contactors, or keep their mass by Dynamics(..., contactors='massy'), "
-            "which lets impact set them in vibration"
+            "whose energy an impact then takes"
         )
 
     def _possible_part(self, needed: Bools, here: Bools, distance: Array) -> str:

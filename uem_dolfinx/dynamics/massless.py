@@ -20,6 +20,7 @@ from uem_dolfinx import forms
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Indices
 from uem_dolfinx.contact.contact import Contact
+from uem_dolfinx.contact.seam.placement import Discretisation
 from uem_dolfinx.dynamics.mass import Mass
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.geometry.bodies import find_bodies
@@ -47,7 +48,7 @@ def without_surfaces(mass: Mass, contacts: Sequence[Contact]) -> Mass:
     named = [contact for contact in contacts if not contact.of_all_surfaces]
     contactors, spare = contactor_nodes(named), np.zeros(config.n_owned, bool)
     for contact in contacts:
-        spare |= _followed(config, contact)[: config.n_owned]
+        spare |= followed_by(config, contact.pair.discretisation)[: config.n_owned]
     spare[contactor_nodes(of_all)] = True
     bare = mass.without(contactors, where_possible=np.flatnonzero(spare), distance=lambda: _distances(contactors, named))
     if of_all:
@@ -82,7 +83,7 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
     config, K = mass.config, None
     massy: Bools = np.asarray(mass.of_nodes.any(axis=1))
     for contact in (c for c in contacts if c.tied is not True and not c.is_further_part):
-        kept = _followed(config, contact)[: config.n_owned] & massy
+        kept = followed_by(config, contact.pair.discretisation)[: config.n_owned] & massy
         bare = not massy[contact.pair.nodes].any()
         if not reduced(config.comm, int(kept.any())) or not reduced(config.comm, int(bare), op=MPI.MIN):
             continue
@@ -97,9 +98,9 @@ def warn_of_soft_targets(mass: Mass, contacts: Sequence[Contact], stiffness: Cal
             )  # fmt: skip
 
 
-def _followed(config: Configuration, contact: Contact) -> Bools:
+def followed_by(config: Configuration, discretisation: Discretisation) -> Bools:
     """Local nodes of a contact's target ``(n_local,)`` (collective)."""
-    return followed_nodes(config, contact.pair.discretisation.followed)
+    return followed_nodes(config, discretisation.followed)
 
 
 def _distances(contactors: Indices, contacts: Sequence[Contact]) -> Array:

@@ -62,6 +62,16 @@ class Scheme:
         """Factor of M in the tangent of a step of length ``dt``."""
         return (1.0 - self.alpha_m) / (1.0 - self.alpha_f) * (1.0 / (self.beta * dt**2))
 
+    @property
+    def lasting(self) -> float:
+        """Factor of ``M^-1 f`` in a(n+1) for forces f that are not averaged but act with their final values."""
+        return (1.0 - self.alpha_f) / (1.0 - self.alpha_m)
+
+    @property
+    def impulse(self) -> float:
+        """Impulse of such forces over f and the length of the step."""
+        return self.gamma * self.lasting
+
     def ending(self, v: Array, a: Array, dt: float) -> tuple[float, Array, float, Array]:
         """Coefficients for the end of a step of length ``dt`` from velocity v and acceleration a.
 

@@ -59,6 +59,11 @@ def recording(
             raise InputError("the problem is being recorded: expected one history at a time")
         if is_explicit(problem.dynamics):
             raise InputError("steps of CentralDifferences have no derivatives: take an implicit scheme, as uem.newmark()")
+        if problem.impacts is not None:
+            raise InputError(
+                "steps of contactors='massy', whose contact acts for whole steps, have no derivatives: take contactors='massless', or "
+                "differences of runs"
+            )
         for contact in problem.contacts:
             if contact.pair.friction is not None:
                 _check_first(problem, f"those of contact '{contact.name}' with friction")

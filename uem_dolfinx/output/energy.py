@@ -121,6 +121,9 @@ class EnergyBook(Closing, given.Sealed):
             )  # fmt: skip
         #: Whether contact strikes masses at the beginning of explicit steps.
         self._struck = is_explicit(self.dynamics) and self.dynamics.contactors == "massy"
+        whole = [] if problem.impacts is None else problem.impacts.pairs
+        #: Contacts whose forces act for whole implicit steps ``(n_contacts,)``.
+        self._lasting = np.array([any(c.pair.whole is pair for pair in whole) for c in self._contacts], dtype=bool)
         # the work of the first step uses the initial load, too
         problem.set_load(self.dynamics.time)
         self._read_forces()
@@ -138,13 +141,15 @@ class EnergyBook(Closing, given.Sealed):
         self._u, self._time, self._driven = u, self.dynamics.time, self.dynamics.driven
         #: Number of steps up to this instant, and the mean velocity of the last one ``(n,)``.
         self._steps, self._rate = problem.step_control.number, np.array(self.dynamics.mean_velocity.x.array[:n])
-        contact = sum((c.force.x.array[:n] for c in self._contacts), np.zeros(n))
+        forces = np.array([c.force.x.array[:n] for c in self._contacts]).reshape(-1, n)
+        contact, lasting = forces[~self._lasting].sum(axis=0), forces[self._lasting].sum(axis=0)
         # the work of supports on mass, with jumps of velocity, is the change of its kinetic energy, see ``driven``
         if (known := problem.bodies.driving) is None:
             problem.bodies.assemble()
             known = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
-        reaction = (known[:n] - contact - linear) * ~problem.bodies.free[: problem.config.n_owned].ravel()
+        held = ~problem.bodies.free[: problem.config.n_owned].ravel()
+        reaction = (known[:n] - contact - linear) * held
         outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
         if problem.bodies.tangent.points is not None:
             outer += problem.bodies.tangent.points.loads().ravel()
@@ -153,8 +158,9 @@ class EnergyBook(Closing, given.Sealed):
             outer -= self.dynamics.added_forces(carried=True)
         #: Forces from outside on these masses, and their displacements.
         self._at_points = [(one.pushed, one.places) for one in added]
-        #: Forces of damping, from outside, of contact, and of equations, from outside as well ``(4, n)``.
-        self._forces = np.stack([self._assembled(self._damping), outer, contact, linear + np.zeros(n)])
+        #: Forces of damping, from outside, of contact, and of equations, from outside as well, then of contact that acts for whole steps,
+        #: and of the supports that it presses ``(6, n)``.
+        self._forces = np.stack([self._assembled(self._damping), outer, contact, linear + np.zeros(n), lasting, held * -lasting])
         self._resultants = np.array([c.resultant().force for c in self._contacts]).reshape(-1, problem.config.gdim)
 
     def _assembled(self, form: Any) -> Array:
@@ -191,7 +197,10 @@ class EnergyBook(Closing, given.Sealed):
             # the forces act between the mean velocities of two steps
             works[2:] = 0.5 * self.dynamics.dt * (self._forces[2:] * (rate + self._rate)).sum(axis=1)
             impulse = self._resultants
-        works[1] += self._driven - driven + works[3]
+        elif steps == 1:
+            works[4:] = (self._forces[4:] * (self._u - u)).sum(axis=1)
+            impulse[self._lasting] = self._resultants[self._lasting]
+        works[1:3] += self._driven - driven + works[3] + works[5], works[4]
         self._works += reduced(self.problem.comm, works[:3])
         pairs = zip(before, self._at_points)
         self._works[1] += sum(0.5 * float(((push + pushed) * (place - was)).sum()) for (push, was), (pushed, place) in pairs)

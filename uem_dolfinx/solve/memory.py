@@ -99,6 +99,8 @@ def take_alone(problem: Any, start: Array | None, fraction: float) -> list[Itera
     """
     progress, dynamics = problem.progress, problem.dynamics
     with agreed(problem.comm):
+        if problem.impacts is not None:
+            problem.impacts.refuse_statics()
         fraction = given.number("fraction", fraction, given.Range("a number from 0 to 1", lambda x: 0 <= x <= 1))
     before, now = (progress.factor, fraction) if dynamics is None else (dynamics.time, dynamics.time)
     known = getattr(problem.load, "at", None) if problem.set_at is None else problem.set_at

@@ -215,13 +215,11 @@ class UnitedProblem(given.Sealed):
         self._of_users = [*scalar, *equations], couplings, [tie.followed for tie in scalar]
         self.unite(self.load, clock.get("at", 0.0))
         options |= {} if self.linear is None else {"linear": self.linear}
-        #: The present ``solve.steps.stages.Stage``, or None.
-        self.stage: Any = None
+        self.stage: Any = None  # the present ``solve.steps.stages.Stage``
         self.system = method(self.bodies, self.interfaces, self.solver, **options)
         #: Length of time steps, with the history needed to control it.
         self.step_control = StepControl()
-        #: Progress in steps and in load.
-        self.progress = Progress()
+        self.progress = Progress()  # in steps and in load
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
         #: Motions of the rigid targets in that state; None for targets that had not moved, and for meshes.
@@ -235,12 +233,15 @@ class UnitedProblem(given.Sealed):
         self.led: tuple[np.ndarray | None, float, bool] = None, 1.0, False
         #: Load factor or time for which loads have been set for the next step; None if they have not been set.
         self.set_at: float | None = None
-        #: Record of all steps for gradients, or None.
-        self.history: Any = None
+        self.history: Any = None  # record of all steps for gradients
+        self.impacts: Any = None  # contacts that act for whole steps
+        if dynamics is not None and dynamics.contactors == "massy" and method is BodySystem:
+            from uem_dolfinx.solve.united.impacts import impacts_of
+
+            self.impacts = impacts_of(self)
         for contact in self.contacts:
             contact.begin(getattr(self.system, "overlaps", {}))
-        #: Warnings issued during steps.
-        self.watch = Watch(self.contacts, rigid)
+        self.watch = Watch(self.contacts, rigid)  # warnings issued during steps
         #: Settings of the run, for checkpoints.
         declared = {"equations": equations, "couplings": linked, "points": points}
         names = {what: ", ".join(type(one).__name__ for one in some) for what, some in declared.items() if some}
@@ -388,7 +389,7 @@ class UnitedProblem(given.Sealed):
             self.history.note(self._before, self.led[2])
         pairs, self.committed = self.interfaces, np.array(self.u.x.array)
         self.largest_forces = np.maximum(self.largest_forces, self.bodies.remembered(bool(self.pairs)))
-        parts: list[Any] = [self.bodies, self.solver, self.dynamics]
+        parts: list[Any] = [self.bodies, self.solver, self.impacts or self.dynamics]
         for part in filter(None, parts):
             part.commit()
         if self.linear is not None:

@@ -306,4 +306,4 @@ def hold_others(problem: Any, bcs: Sequence[Any]) -> None:
         problem.system.take(problem.interfaces, problem.linear)
     problem.set_load(dynamics.time, known=True)
     dynamics.accelerated = False
-    problem.system.accelerate()
+    (problem.impacts or problem.system).accelerate()

@@ -35,6 +35,8 @@ class Limits:
 
     def __init__(self, areas: Callable[[Array | None], Array], duration: Callable[[], float] | None):
         self.areas_of, self.duration = areas, duration
+        #: Whether friction acts for whole steps with its force at the end.
+        self.whole = False
         #: Normal forces at which limits are fixed ``(n,)``, or None.
         self._held: Array | None = None
 
@@ -43,6 +45,10 @@ class Limits:
         self.law, self.value = law, value
         self.area = self.areas_of(None) if law.per_area else np.zeros(len(value))
         self.speed = np.zeros(len(value))
+
+    def act_whole_steps(self) -> None:
+        """From now on friction acts for whole steps, with its force at the end."""
+        self.whole = True
 
     def change(self, value: Array) -> None:
         """Set other values of the parameter ``(n,)``."""

@@ -427,7 +427,8 @@ class Sliding:
         # in a corner, friction is the part within the cones of its facets
         slopes = self.limits.cones(np.linalg.norm(state.force, axis=1))
         tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slopes, end) * share, _of(state).tau)
-        return tau, start, end, stick_slip.work(_of(committed).tau, tau, start, end, self.frame.cornered)
+        first, last = (0.0 * start, 2.0 * end) if self.limits.whole else (start, end)
+        return tau, start, end, stick_slip.work(_of(committed).tau, tau, first, last, self.frame.cornered)
 
     def _ways(self, kinematics: Kinematics) -> tuple[Array, Array]:
         """Relative motions since the last step, per unit of friction at its start and at its end ``(n, gdim)`` (collective)."""

@@ -284,6 +284,11 @@ class GeneralContact(OfProblem, given.Sealed):
         """Number of active contactors over all ranks; a node counts once for each body that it touches (collective)."""
         return sum(part.n_active for part in self.parts)
 
+    @property
+    def dissipation(self) -> float:
+        """Energy dissipated by friction and by damping in all committed steps (collective)."""
+        return sum(part.dissipation for part in self.parts)
+
     def max_gap(self) -> float:
         """Largest gap of an active contactor, a length (collective)."""
         return max(part.max_gap() for part in self.parts)

@@ -133,7 +133,7 @@ def _time_steps(
     control.begin(dt)
     problem.set_load(dynamics.time)
     first = not dynamics.accelerated
-    problem.system.accelerate()
+    (problem.impacts or problem.system).accelerate()
     if first and problem.history is not None:
         problem.history.note_start()
     before, rounding = touching(problem), _rounding(dynamics, dt, end)
@@ -229,13 +229,18 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
 
 
 def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
-    """EnergyGivenError for a step in which contacts have added energy beyond the limit; with massy contactors a warning (collective).
+    """EnergyGivenError for a step in which contacts have added energy beyond the limit (collective).
 
     In the trapezoidal rule, contactors that are released or slide round a bend do work with half of their initial force; it decreases
     with the step length. A contactor that has sunk past the target's end and is put back causes an impact in any step, and is ignored
-    from the next attempt on. Contactors with mass gain energy in steps of any length.
+    from the next attempt on. With methods other than elimination, contactors with mass gain energy in steps of any length.
     """
     control = problem.step_control
+    if problem.impacts is not None:
+        # contact acts for the whole step, with twice its mean force at the end
+        before = []
+    elif dynamics.contactors == "massy":
+        return
     if not (forces := before + _contact_forces(problem)):
         return
     config = problem.config
@@ -243,9 +248,6 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
     given = reduced(problem.comm, 0.5 * float(sum(f @ way for f in forces)))
     words = control.too_much(given, length, dynamics.kinetic_energy, lambda: _held_by(problem, forces))
     if words is None:
-        return
-    if dynamics.contactors != "massless":
-        logger.warning("%s, from time %.6g: their contactors have mass; take contactors='massless'", words, dynamics.time)
         return
     barred = [_bar_returned(pair) for pair in problem.pairs]
     for pair, count in zip(problem.pairs, barred):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -362,14 +362,14 @@ class BodySystem:
         """
         return self.present_rows().test.transpose(self.residual())
 
-    def accelerate(self) -> None:
-        """Find the initial acceleration of the bodies (collective)."""
+    def accelerate(self, restriction: Callable[[], Restriction] | None = None) -> None:
+        """Find the initial acceleration of the bodies, with P of all equations or what ``restriction`` returns (collective)."""
         dynamics = self.bodies.dynamics
         if dynamics is not None and not dynamics.accelerated:
             self.place()
             self.bodies.assemble()
             self.floating.begin_motion()
-            dynamics.accelerate(self.restriction(), F := self.residual(), added_mass(self.linear, F))
+            dynamics.accelerate((restriction or self.restriction)(), F := self.residual(), added_mass(self.linear, F))
             if self.linear is not None:
                 self.linear.settle(dynamics)
 
