@@ -110,8 +110,8 @@ from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.solve.problem import UnitedProblem
+from uem_dolfinx.solve.stepping import LoadStep
 from uem_dolfinx.solve.steps.dissipation import Dissipation
-from uem_dolfinx.solve.steps.load_step import LoadStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
 
 if _TYPE_CHECKING:
@@ -156,48 +156,34 @@ if _TYPE_CHECKING:
     from uem_dolfinx.scripting import assemble_matrix, assemble_vector, dirichlet, ds, dx, form, integrate, interpolate
     from uem_dolfinx.solve.modes import Vibrations, modes
     from uem_dolfinx.solve.settings import Newton
+    from uem_dolfinx.solve.stepping import TimeStep
     from uem_dolfinx.solve.steps.stages import Step
-    from uem_dolfinx.solve.steps.time_step import TimeStep
     from uem_dolfinx.solve.steps.time_steps import time_steps
 
-#: Modules that are imported on first use of one of their names.
+#: Names whose modules are imported on first use of one of them.
 _LATER = {
-    "Conductance": "contact.laws.conductance", "Stribeck": "contact.laws.stribeck", "SoftContact": "contact.laws.soft",
-    "Thirion": "contact.laws.stribeck",
-    "Exponential": "contact.laws.soft", "PowerLaw": "contact.laws.soft",
-    "Adhesion": "contact.laws.soft",
-    "Leak": "contact.laws.leak",
-    "Cohesive": "contact.laws.cohesive", "BenzeggaghKenane": "contact.laws.cohesive", "Power": "contact.laws.cohesive",
-    "OfTemperature": "contact.laws.law", "read_mesh": "geometry.mesh_files", "read_deck": "decks.reading", "Deck": "decks.deck",
-    "CentralDifferences": "dynamics.scheme",
-    "Dynamics": "dynamics.inertia", "Mass": "dynamics.mass", "consistent_mass": "dynamics.mass",
-    "lumped_mass": "dynamics.mass", "nodal_mass": "dynamics.mass",
-    "Scheme": "dynamics.scheme", "generalised_alpha": "dynamics.scheme", "newmark": "dynamics.scheme",
-    "TimeStep": "solve.steps.time_step", "time_steps": "solve.steps.time_steps",
-    "Checkpoint": "restart.checkpoint", "read_checkpoint": "restart.checkpoint", "write_checkpoint": "restart.checkpoint",
-    "State": "restart.state",
-    "example_mesh": "geometry.gmsh", "read_gmsh": "geometry.gmsh",
-    "assemble_matrix": "scripting", "assemble_vector": "scripting", "form": "scripting",
-    "dirichlet": "scripting", "ds": "scripting", "dx": "scripting", "integrate": "scripting", "interpolate": "scripting",
-    "ViscousFriction": "contact.laws.stribeck", "PointLoad": "conditions.at_points", "PointSpring": "conditions.at_points",
-    "Equation": "conditions.equation", "periodic": "conditions.equation", "MeanMotion": "conditions.equation",
-    "RigidCoupling": "conditions.rigid_coupling", "Ball": "conditions.joints", "Hinge": "conditions.joints",
-    "Slider": "conditions.joints", "Spring": "conditions.joints",
-    "Preload": "contact.preload",
-    "FinitePlasticity": "materials.finite_plasticity", "Voce": "materials.hardening", "VonMises": "materials.von_mises",
-    "HistoryWriter": "output.results", "ResultsWriter": "output.results",
-    "plot_energies": "output.curves", "plot_history": "output.curves", "Results": "output.reading", "read_results": "output.reading",
-    "Energies": "output.energy", "EnergyBook": "output.energy", "animate": "output.films", "outline": "output.frames",
-    "figure": "output.pictures", "plot_pressure": "output.pictures", "plot_scene": "output.pictures",
-    "plot_setup": "output.pictures",
-    "Adaptation": "accuracy.adapt", "adapt": "accuracy.adapt",
-    "ErrorEstimate": "accuracy.estimate", "error_estimate": "accuracy.estimate", "ErrorLimit": "accuracy.estimate",
-    "GoalError": "accuracy.goal", "goal_error": "accuracy.goal",
-    "ContactParameter": "gradients.parameters",
-    "gradient": "gradients.gradient", "tangent": "gradients.gradient", "taylor_test": "gradients.gradient",
-    "History": "gradients.history", "recording": "gradients.recording",
-    "Newton": "solve.settings",
-    "Step": "solve.steps.stages", "SurfaceWriter": "output.surfaces", "Vibrations": "solve.modes", "modes": "solve.modes",
+    name: module
+    for module, names in {
+        "accuracy.adapt": "Adaptation adapt", "accuracy.estimate": "ErrorEstimate error_estimate ErrorLimit",
+        "accuracy.goal": "GoalError goal_error", "conditions.at_points": "PointLoad PointSpring",
+        "conditions.equation": "Equation periodic MeanMotion", "conditions.joints": "Ball Hinge Slider Spring",
+        "conditions.rigid_coupling": "RigidCoupling", "contact.laws.cohesive": "Cohesive BenzeggaghKenane Power",
+        "contact.laws.conductance": "Conductance", "contact.laws.law": "OfTemperature", "contact.laws.leak": "Leak",
+        "contact.laws.soft": "SoftContact Exponential PowerLaw Adhesion", "contact.laws.stribeck": "Stribeck Thirion ViscousFriction",
+        "contact.preload": "Preload", "decks.deck": "Deck", "decks.reading": "read_deck", "dynamics.inertia": "Dynamics",
+        "dynamics.mass": "Mass consistent_mass lumped_mass nodal_mass",
+        "dynamics.scheme": "CentralDifferences Scheme generalised_alpha newmark", "geometry.gmsh": "example_mesh read_gmsh",
+        "geometry.mesh_files": "read_mesh", "gradients.gradient": "gradient tangent taylor_test", "gradients.history": "History",
+        "gradients.parameters": "ContactParameter", "gradients.recording": "recording", "materials.finite_plasticity": "FinitePlasticity",
+        "materials.hardening": "Voce", "materials.von_mises": "VonMises", "output.curves": "plot_energies plot_history",
+        "output.energy": "Energies EnergyBook", "output.films": "animate", "output.frames": "outline",
+        "output.pictures": "figure plot_pressure plot_scene plot_setup", "output.reading": "Results read_results",
+        "output.results": "HistoryWriter ResultsWriter", "output.surfaces": "SurfaceWriter",
+        "restart.checkpoint": "Checkpoint read_checkpoint write_checkpoint", "restart.state": "State",
+        "scripting": "assemble_matrix assemble_vector form dirichlet ds dx integrate interpolate", "solve.modes": "Vibrations modes",
+        "solve.settings": "Newton", "solve.stepping": "TimeStep", "solve.steps.stages": "Step", "solve.steps.time_steps": "time_steps",
+    }.items()
+    for name in names.split()
 }  # fmt: skip
 
 

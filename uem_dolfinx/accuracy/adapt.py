@@ -37,12 +37,6 @@ CANDIDATES = 16
 INVERTED_IN = 5
 
 
-def refuse_first_guess(problem: UnitedProblem) -> None:
-    """Refuse problems whose solution depends on the path to it."""
-    if what := depends_on_path(problem):
-        raise InputError(f"solve_again: the problem has {what}, so that its solution depends on the path: leave solve_again out")
-
-
 def carry_over(before: UnitedProblem, after: UnitedProblem) -> None:
     """Set the displacement of ``after`` to that of ``before``, interpolated in the cells of the same body (collective)."""
     old, new = before.config, after.config
@@ -354,7 +348,9 @@ def _solved(
     given.kind("what make returns", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     if solve_again is not None:
         with agreed(problem.comm):
-            refuse_first_guess(problem)
+            if what := depends_on_path(problem):
+                where = "so that its solution depends on the path: leave solve_again out"
+                raise InputError(f"solve_again: the problem has {what}, {where}")
         if before is not None:
             carry_over(before, problem)
             try:

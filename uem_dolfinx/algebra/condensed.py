@@ -140,16 +140,7 @@ class Condensed(Returning):
         return touched
 
     def factorise(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, pc: PETSc.PC, symmetric: bool) -> bool:
-        """Factorise K without the nodes in contact; whether this is cheaper than a full factorisation and succeeded (collective).
-
-        Args:
-            P: of a constrained matrix.
-            Q: of the same matrix.
-            K: the tangent.
-            G: the curvature.
-            pc: for MUMPS, without a matrix.
-            symmetric: whether K is.
-        """
+        """Factorise K without the nodes in contact; whether this is cheaper than a full factorisation and succeeded (collective)."""
         space, followed = self.space, self._followed(P, Q, holding=False)
         nodes = self._touched(P, Q, G, followed, holding=False)
         if self._is_of(K) and not self._begins:
@@ -234,12 +225,7 @@ class Condensed(Returning):
         self.negative, self.indefinite, self.whole = solved.negative, solved.indefinite, True
 
     def begin_at(self, c: PETSc.Vec | None, rounding: float = 0.0) -> None:
-        """Set the increment to which the next solves add ``P dq``.
-
-        Args:
-            c: that increment; None is zero, and solves then complete the unknowns of I at once.
-            rounding: norm below which forces on I are rounding.
-        """
+        """Set the increment c to which the next solves add ``P dq``; None is zero, and they then complete the unknowns of I at once."""
         self._closure, self._rounding = c, rounding
 
     def solve(self, rhs: PETSc.Vec, again: bool = False, accuracy: float = 0.0) -> PETSc.Vec:
@@ -263,7 +249,8 @@ class Condensed(Returning):
             left.array[at] += self._stiffness(c.array_r[at] - du.array_r[at])
             left = Q.transpose(left)
             dq = du.copy()
-            dq.array[at] = self._on_contact(rhs.array_r[at] - left.array_r[at])
+            on_c = on_root(self.space.comm, rhs.array_r[at] - left.array_r[at])
+            dq.array[at] = self._scattered(None if self._dense is None else self._dense.solve(on_c))
             dq.array[~P.used.ravel()] = 0.0
         return self.complete(dq) if self._closure is None else dq
 
@@ -285,13 +272,7 @@ class Condensed(Returning):
         return du, forms.product(K, du)
 
     def forces(self, K: PETSc.Mat, du: PETSc.Vec, exact: bool) -> PETSc.Vec:
-        """``K du`` of an increment of the last solve, except at prescribed components outside the contact (collective).
-
-        Args:
-            K: the tangent.
-            du: the increment.
-            exact: whether the forces on I are solved to rounding.
-        """
+        """``K du`` of an increment of the last solve, not at prescribed components outside the contact; ``exact`` or not (collective)."""
         if not self.whole and self._known is not None:
             (before, known), at = self._known, self._at
             forces = known.copy()
@@ -329,11 +310,6 @@ class Condensed(Returning):
         found.array[self._at] = 0.0
         return found
 
-    def _on_contact(self, rhs: Array) -> Array:
-        """Solution of the dense problem at this rank's components of C (collective)."""
-        every = on_root(self.space.comm, rhs)
-        return self._scattered(None if self._dense is None else self._dense.solve(every))
-
     def _stiffness(self, du: Array) -> Array:
         """``S du_C`` at this rank's components of C (collective)."""
         every = on_root(self.space.comm, du)
@@ -359,15 +335,7 @@ class Condensed(Returning):
 
 
 class _Dense:
-    """``Q'(S + G)P`` of the used components, factorised.
-
-    Args:
-        transposed: Schur complement, transposed ``(k, k)``.
-        G: curvature, sparse, or None.
-        P: its used columns, sparse ``(k, m)``.
-        Q: the used columns of Q, or None if Q is P.
-        used: mask of all components ``(k,)``.
-    """
+    """``Q'(S + G)P`` of the ``used`` components, factorised, from the transposed Schur complement, and Q None if it is P."""
 
     def __init__(self, transposed: Array, G: Any, P: Any, Q: Any, used: Bools):
         from scipy.linalg import lapack

@@ -45,11 +45,7 @@ PLENTY = 200
 
 
 class Deflation:
-    """A deflated preconditioner, of PETSc's Python type.
-
-    Args:
-        inner: preconditioner that needs deflation.
-    """
+    """A deflated preconditioner, of PETSc's Python type, around an ``inner`` one."""
 
     def __init__(self, inner: PETSc.PC):
         self.inner, self.comm = inner, inner.comm

@@ -92,16 +92,10 @@ class Group:
         return np.where(pulled, np.minimum(opened, lam), lam)
 
     def rotated(self, rows: UnitingEquations) -> Group:
-        """The group of the conflicting equations in other directions, with the same eliminated components.
+        """The group of the conflicting equations, ``rows`` in their order, in other directions, with the same eliminated components.
 
-        With the given rows ``A`` and the shares ``S`` the independent rows are again ``S'A``. They are solved for the same components,
-        so that forces of the given equations keep their ratios.
-
-        Args:
-            rows: all conflicting equations, in their order, of global nodes.
-
-        Raises:
-            LinAlgError: if the equations no longer determine these components.
+        With the given rows ``A`` and the shares ``S`` the independent rows are again ``S'A``. They are solved for the same components, or a
+        LinAlgError is raised, so that forces of the given equations keep their ratios.
         """
         own, m, terms = self.independent, len(self.given), np.flatnonzero(np.isin(rows.row, self.given))
         nodes = np.union1d(self.nodes, rows.followed[terms])
@@ -166,12 +160,9 @@ class IndependentEquations:
         self._scatter(equations)
 
     def rotated(self, equations: UnitingEquations) -> IndependentEquations:
-        """The same equations in other directions, with the same eliminated components (collective).
+        """The same equations in the same order in other directions, with the same eliminated components (collective).
 
         Equations that no longer determine these components are unchanged and marked in ``undetermined``.
-
-        Args:
-            equations: of this rank's contactors, in the order of the original equations.
         """
         other, rows = copy(self), self._gather(equations)
         other.redundant, other._groups, singular = self.redundant.copy(), [], np.zeros(len(rows), dtype=bool)

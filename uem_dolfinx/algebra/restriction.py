@@ -316,14 +316,10 @@ class Restriction:
         total, eq = part.copy(), self._held
         for _ in range(self.chain):
             along = np.einsum("mg,mg->m", self.lift[self.equations.active], part[eq.node])
-            part = self._to_followed(eq.coefficients * along[eq.row][:, None])
+            assert self._halo is not None
+            part = self._halo.add(sums_of_rows(self._term, eq.coefficients * along[eq.row][:, None], len(self._follows)))
             total += part
         return self.space.vector(total)
-
-    def _to_followed(self, values: Array) -> Array:
-        """Sums of the terms' values at the nodes that they follow ``(n_owned, block)`` (collective)."""
-        assert self._halo is not None
-        return self._halo.add(sums_of_rows(self._term, values, len(self._follows)))
 
     def reduce(self, y: PETSc.Vec) -> PETSc.Vec:
         """``T' y``; with y from ``pass_on`` this is ``P'F``."""

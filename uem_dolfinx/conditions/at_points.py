@@ -99,12 +99,7 @@ class PointSpring(given.Sealed):
 
 
 class AtPoints:
-    """All loads and springs at nodes of a problem (collective).
-
-    Args:
-        declared: loads and springs as declared by users.
-        couplings: attached; their forces and moments act at nodes, too.
-    """
+    """All loads and springs at nodes of a problem; those of couplings act at nodes, too (collective)."""
 
     def __init__(
         self, config: Configuration, declared: Sequence[PointLoad | PointSpring], couplings: Sequence[RigidCoupling] = ()

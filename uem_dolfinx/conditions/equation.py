@@ -293,11 +293,7 @@ def checked_value(name: str, value: Any, size: int | None) -> Any:
 
 
 def values_of(name: str, value: Any, size: int | None) -> Array:
-    """Numbers of a right-hand side: ``(size,)``; a single 0 is a vector of zeros.
-
-    Raises:
-        InputTypeError, InputError: if they are not finite, or if their number is wrong.
-    """
+    """Numbers ``(size,)`` of a right-hand side, 0 for zeros; InputTypeError or InputError if not finite or of another number."""
     words = "a finite number" if size == 1 else f"{size or '2 or 3'} finite numbers, one for each component"
     held = isinstance(value, fem.Constant)
     try:

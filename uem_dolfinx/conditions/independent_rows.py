@@ -55,13 +55,7 @@ class Solved:
 
 
 def sizes(config: Configuration, rows: GivenRows, free: Bools) -> Array:
-    """Sizes of coefficients of components that can be eliminated, relative to the largest in their row ``(k, gdim)`` (collective).
-
-    Args:
-        config: configuration of the displacement.
-        rows: of this rank.
-        free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
-    """
+    """Sizes of coefficients of ``free (n_owned, gdim)`` components, relative to the largest in their row ``(k, gdim)`` (collective)."""
     largest = np.zeros(len(rows))
     np.maximum.at(largest, rows.row, np.abs(rows.coefficients).max(axis=1, initial=0.0))
     movable = config.ask_owners(rows.node, free.astype(float)) > 0

@@ -90,12 +90,7 @@ class Link(given.Sealed, ABC):
 
     @abstractmethod
     def stored(self, at: dict[int, Placement], z: Array | None) -> tuple[float, Array, Array, Array]:
-        """Energy, its slope ``(12,)`` and its material and geometric second derivatives ``(12, 12)``.
-
-        Args:
-            at: placements by id of their coupling; the reference with small rotations.
-            z: small motions from there ``(12,)``; None with large rotations.
-        """
+        """Energy, slope ``(12,)``, material and geometric second derivatives ``(12, 12)``; z are small motions from ``at``, or None."""
 
     def places(self) -> dict[int, Placement]:
         """Present placements by id of their coupling; the reference with small rotations (collective)."""

@@ -107,11 +107,7 @@ class Linked:
         return material, geometric
 
     def check(self, off: Array, bound: float) -> None:
-        """Refuse joints whose equations leave distances ``(k,)`` larger than a bound, as other equations contradict them.
-
-        Raises:
-            ConflictError: names the first joint.
-        """
+        """ConflictError for the first joint whose equations leave distances ``(k,)`` larger than a bound, as others contradict them."""
         first = 0
         for joint in self.joints:
             own = off[first : first + joint.n_rows]

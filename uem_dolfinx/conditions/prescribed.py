@@ -46,12 +46,7 @@ class Rule:
             self._places: Array = values.function_space.tabulate_dof_coordinates()[dofs].T
 
     def take_load(self, comm: MPI.Comm, at: float) -> None:
-        """Evaluate the value at a load factor or time (collective).
-
-        Raises:
-            UserFunctionError: if the function raises.
-                InputError: for values of another shape.
-        """
+        """Evaluate the value at a load factor or time; UserFunctionError if it raises, InputError for another shape (collective)."""
         if isinstance(self.value, Expr):
             self.interpolate()
             return

@@ -283,11 +283,7 @@ def _number(value: Any, point: Array) -> Any:
 
 
 def checked_inertia(value: npt.ArrayLike, n_turns: int) -> Array:
-    """Inertia as a matrix ``(n_turns, n_turns)``.
-
-    Raises:
-        InputError, InputTypeError: if a principal moment is negative, or exceeds the sum of the others.
-    """
+    """Inertia ``(n_turns, n_turns)``; InputError or InputTypeError if a principal moment is negative or exceeds the sum of the others."""
     if given.symbolic(value) or np.ndim(value) == 0:
         return np.eye(n_turns) * given.number("inertia", value, given.NOT_NEGATIVE)
     words = "a number" if n_turns == 1 else "a number, or a symmetric matrix of 3 rows"

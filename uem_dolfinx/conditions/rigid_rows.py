@@ -170,14 +170,7 @@ class RigidRows:
         self._config.shift(s.nodes, np.where(self._free, change, 0.0))
 
     def end_step(self, forces: Array) -> None:
-        """Store the number of turns and reactions, and refuse values that no rigid motion satisfies (collective).
-
-        Args:
-            forces: of the equations at the owned nodes ``(n_owned, gdim)``.
-
-        Raises:
-            ConflictError: names the position, or the joint.
-        """
+        """Store the number of turns and reactions, and refuse values that no rigid motion satisfies by a ConflictError (collective)."""
         config, s, eq, g = self._config, self.set, self.at_present(), self._config.gdim
         here, held = config.displacement[: config.n_owned], iter(self._wanted)
         for one in self.couplings:

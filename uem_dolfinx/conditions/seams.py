@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 class Seams:
-    """Equations of users by which two nodes have one displacement, up to a jump.
-
-    Attributes:
-        given: equations that were given on this rank, several lists.
-    """
+    """Equations of users by which two nodes have one displacement, up to a jump; from several lists that were given on this rank."""
 
     def __init__(self, given: Sequence[GivenRows]):
         self.given = given
@@ -30,15 +26,7 @@ class Seams:
         self._differences = np.concatenate([np.zeros((0, 3), np.int64), *(_differences(*terms) for terms in self._terms)])
 
     def groups(self, space: Nodes, nodes: Indices) -> tuple[Ints, Ints]:
-        """Groups of nodes with one displacement that contain one of the given nodes, the same on all ranks (collective).
-
-        Args:
-            space: all nodes.
-            nodes: owned ones, of a contactor ``(n,)``.
-
-        Returns:
-            Global nodes ``(k,)``, ascending, and the number of the group of each ``(k,)``.
-        """
+        """Global nodes ``(k,)``, ascending, with one displacement as one of these, and their groups, the same on all ranks (collective)."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 

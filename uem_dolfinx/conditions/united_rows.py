@@ -236,11 +236,7 @@ class UnitedRows:
         return float((np.abs(self.equations.gap) / self._size).max(initial=0.0))
 
     def check(self) -> None:
-        """Refuse values that contradict each other or Dirichlet values: equations left out must be satisfied, too (collective).
-
-        Raises:
-            ConflictError: names the position.
-        """
+        """ConflictError for values that contradict each other or Dirichlet values: equations left out must hold, too (collective)."""
         config, left = self._config, self._left
         if not reduced(config.comm, len(left)):
             return

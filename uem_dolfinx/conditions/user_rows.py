@@ -192,13 +192,7 @@ class UserRows:
         return equations
 
     def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
-        """Multipliers of the couplings' equations ``(k,)`` together with other equations in their original form (collective).
-
-        Args:
-            multipliers: together with the rewritten equations ``(k,)``.
-            equations: the other equations in their original form.
-            lam: their multipliers ``(m,)``.
-        """
+        """Multipliers of couplings ``(k,)`` from those with rewritten equations, whose original ones have ``lam (m,)`` (collective)."""
         # original equations act on the eliminated components directly
         forces = forces_of(self._config, equations, np.where(equations.active, lam, 0.0))
         parts = [np.where(one.eliminated, forces[one.set.nodes], 0.0).ravel() for one in self.each]

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 from mpi4py import MPI
@@ -20,14 +21,44 @@ from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Bools, Ints
-from uem_dolfinx.dynamics.densities import as_density, cell_masses
-from uem_dolfinx.errors import MassError
+from uem_dolfinx.errors import MassError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.bodies import body_sums, find_bodies, rigid_velocities
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR
 from uem_dolfinx.geometry.configuration import Configuration, configuration_of
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
+
+
+def as_density(config: Configuration, rho: Any) -> Any:
+    """The density as a UFL expression that forms can contain."""
+    if isinstance(rho, (Real, ufl.constantvalue.ConstantValue)) and not given.truth(rho):
+        # UFL drops terms with a literal zero
+        return fem.Constant(config.mesh, float(rho))
+    if not isinstance(rho, ufl.core.expr.Expr):
+        raise MassError(f"the density {rho!r} is neither a number nor a Function nor a UFL expression: give one of them")
+    if rho.ufl_shape != ():
+        raise MassError(f"the density {rho} has shape {rho.ufl_shape}: give a scalar")
+    if ufl.algorithms.extract_arguments(rho):
+        raise MassError(f"the density {rho} contains a test or trial function: give a known field")
+    if any(domain != config.mesh.ufl_domain() for domain in ufl.domain.extract_domains(rho)):
+        raise SpaceError("the density is on another mesh than the displacement: make both on one mesh")
+    return rho
+
+
+def cell_masses(config: Configuration, density: Any) -> Array:
+    """Masses of the owned cells ``(n_cells,)``; MassError if one is negative or not finite (collective)."""
+    S = compat.function_space(config.mesh, ("DG", 0))
+    n_cells = config.mesh.topology.index_map(config.tdim).size_local
+    of_dofs = forms.assemble_array(S, forms.form(revolved(density * ufl.TestFunction(S) * ufl.dx)))
+    masses = of_dofs[compat.cell_dofs(S)[:n_cells, 0]]
+    wrong, error = np.flatnonzero(~((masses >= 0) & np.isfinite(masses))), None
+    if len(wrong):
+        where = ", ".join(f"{c:.6g}" for c in config.X[compat.cell_dofs(config.V)[wrong[0]]].mean(axis=0))
+        error = MassError(f"the cell at ({where}) has the mass {masses[wrong[0]]:.6g}: give a finite density of at least 0")
+    agree(config.comm, error)
+    return masses
+
 
 #: Row sums are the nodal masses of a body if no sum is less than this part of the mass by diagonal scaling.
 #: [convention; nodal mass; test_thresholds_motion.py::test_small_row_sums]

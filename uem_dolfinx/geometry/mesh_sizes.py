@@ -69,7 +69,8 @@ class MeshSizes:
             # the same order and the same digits on any ranks, since Gmsh makes other meshes of sizes that differ by rounding
             order = np.lexsort(self.points.reshape(len(sizes), -1).T)
             numbers, self.points, sizes = numbers[order], self.points[order], sizes[order]
-            vertices, count = _unique(numbers)
+            known, vertices = np.unique(numbers, return_inverse=True)
+            vertices, count = vertices.reshape(numbers.shape), len(known)
             self.values = np.exp(np.round(np.log(graded(vertices, count, self.points, sizes)), DIGITS))
             edges = vertices[:, [0] * (n_vertices - 1)].ravel(), vertices[:, 1:].ravel()
             of_vertices = connected_components(coo_matrix((np.ones(len(edges[0])), edges), shape=(count, count)))[1]
@@ -166,12 +167,6 @@ def _beyond(points: Array, values: Array) -> tuple[Array, Array]:
     middle, mean = points[outside].mean(axis=1, keepdims=True), values[outside].mean(axis=1, keepdims=True)
     there = np.maximum(mean + ENLARGED * (values[outside] - mean), values[outside].min(axis=1, keepdims=True))
     return middle + ENLARGED * (points[outside] - middle), there
-
-
-def _unique(numbers: Ints) -> tuple[Ints, int]:
-    """Vertices of cells ``(m, k)`` counted without gaps, and how many there are."""
-    known, inverse = np.unique(numbers, return_inverse=True)
-    return inverse.reshape(numbers.shape), len(known)
 
 
 def graded(vertices: Ints, count: int, points: Array, sizes: Array) -> Array:

@@ -252,14 +252,9 @@ class Linearised:
         turned = [part for _, state, own in acts if own for part in own.turned(state)]
         return together(together(curvature, gaps), contact_curvature(turned, like) if turned else None)
 
-    @property
-    def _turns_back(self) -> bool:
-        """Whether the adjoint problem has another matrix."""
-        return self._K_back is not self.K or self._G_back is not self.G
-
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
         """``a = Q mu`` of the adjoint problem under forces (collective)."""
-        if self._turns_back:
+        if self._K_back is not self.K or self._G_back is not self.G:
             self.problem.solver.set_operator(self.P, self._K_back, self._G_back)
         return self.solve(forces)
 

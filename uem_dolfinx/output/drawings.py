@@ -263,7 +263,8 @@ class Drawn2D(Drawn):
             if how.cells:
                 ax.add_collection(LineCollection(x[self.pieces.edges], colors="k", linewidths=0.25, alpha=0.35))
         add_colour_bar(ax, coloured, how.label, float(np.divide(*np.diff(self.box, axis=1).ravel())))
-        self._draw_rigid(ax, frame)
+        for shape in frame.rigid:
+            draw_rigid(ax, shape, self.box, how.mirror)
         ax.set(xlim=self.box[0], ylim=self.box[1], aspect="equal", xlabel="x", ylabel="y")
         at, arrows = self._arrows(frame)
         for side in self.sides if len(at) else ():
@@ -271,11 +272,6 @@ class Drawn2D(Drawn):
                 *(at * [side, 1.0]).T, *(arrows * [side, 1.0]).T, angles="xy", scale_units="xy", scale=1.0,
                 color=FORCE, edgecolor="w", linewidth=0.4, units="inches", width=0.03, zorder=3,
             )  # fmt: skip
-
-    def _draw_rigid(self, ax: Any, frame: Frame) -> None:
-        """Rigid targets, hatched behind their surface."""
-        for shape in frame.rigid:
-            draw_rigid(ax, shape, self.box, self.how.mirror)
 
 
 def add_colour_bar(ax: Any, colours: Any, label: str, aspect: float, **how: Any) -> None:

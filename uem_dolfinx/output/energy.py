@@ -22,7 +22,7 @@ from uem_dolfinx.output.results import contact_suffixes
 from uem_dolfinx.output.tables import Closing, CsvTable
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps.time_step import TimeStep
+from uem_dolfinx.solve.stepping import TimeStep
 
 
 @dataclass(frozen=True)

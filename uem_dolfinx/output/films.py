@@ -16,8 +16,7 @@ from uem_dolfinx.output.pictures import new_canvas, plot_scene
 from uem_dolfinx.output.tables import given_path
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps.load_step import LoadStep
-from uem_dolfinx.solve.steps.time_step import TimeStep
+from uem_dolfinx.solve.stepping import LoadStep, TimeStep
 
 T = TypeVar("T")
 

@@ -21,8 +21,7 @@ from uem_dolfinx.log import logger, timed
 from uem_dolfinx.output.tables import Closing, Columns, CsvTable, PairTables, refuse_shared
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps.load_step import LoadStep
-from uem_dolfinx.solve.steps.time_step import TimeStep
+from uem_dolfinx.solve.stepping import LoadStep, TimeStep
 
 #: Names of contact fields in the files of a ``ResultsWriter``, where they differ.
 CALLED = {"pressure": "contact_pressure", "force": "contact_force"}

@@ -18,8 +18,7 @@ from uem_dolfinx.output.results import clock, contact_fields, contact_suffixes, 
 from uem_dolfinx.output.tables import Closing
 from uem_dolfinx.parallel import agree, agreed
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.steps.load_step import LoadStep
-from uem_dolfinx.solve.steps.time_step import TimeStep
+from uem_dolfinx.solve.stepping import LoadStep, TimeStep
 
 #: VTK's numbers of facets by their cell and degree.
 VTK_TYPES = {

@@ -78,11 +78,7 @@ def check_dynamics(dynamics: Any, contacts: Sequence[Any], others: Mapping[str, 
 
 
 def check_couplings(couplings: Any) -> tuple[list[RigidCoupling], list[Any]]:
-    """The couplings of a list of couplings, joints and springs, and all of them, couplings first.
-
-    Raises:
-        InputTypeError: for other objects.
-    """
+    """The couplings of a list of couplings, joints and springs, and all of them, couplings first; InputTypeError for other objects."""
     found = given.items(
         "couplings",
         couplings,
@@ -102,11 +98,7 @@ def rigid_nodes(config: Configuration, free: Bools, couplings: Sequence[RigidCou
 
 
 def check_checkpoint(checkpoint: Any) -> None:
-    """Refuse anything but a Checkpoint or None.
-
-    Raises:
-        InputTypeError: for other objects.
-    """
+    """Refuse anything but a Checkpoint or None by an InputTypeError."""
     if checkpoint is not None:
         from uem_dolfinx.restart.checkpoint import Checkpoint
 

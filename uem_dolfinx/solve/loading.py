@@ -54,11 +54,7 @@ class ByFunction:
 
 
 def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
-    """The load as a function of the factor or the time, or as Constants and their values, each numbers or a function; or None.
-
-    Raises:
-        InputTypeError, InputError: for other objects and values.
-    """
+    """The load as a function, or as Constants and their values, numbers or functions; or None. InputTypeError or InputError for others."""
     expected = "a scalar Constant, a dictionary of Constants and their values, a function of the load factor or time, or None"
     if isinstance(load, fem.Constant):
         if np.shape(load.value) != ():
@@ -388,3 +384,28 @@ def in_rows(problem: Any, held: Array | float) -> Array:
                 "this ramp, load factor 1, or conditions that are the same in all steps"
             )
     return np.asarray(problem.config.rows(np.where(bodies.held, held, 0.0)[: len(bodies.residual_of_all)]))
+
+
+def reactions(problem: Any) -> Array:
+    """Reactions of Dirichlet conditions in the present state, without contacts and equations, at all unknowns ``(n,)`` (collective).
+
+    Rounding at unknowns without condition, zero at ghosts; for other fields the flow into the body.
+    """
+    bodies, config = problem.bodies, problem.config
+    bodies.assemble()
+    own = bodies.residual_of_all
+    forces: Array = np.zeros(len(bodies.held))
+    forces[: len(own)] = own
+    at = owned_displacement(problem)
+    for contact in problem.contacts:
+        forces[at] -= contact.force.x.array.reshape(-1, config.gdim)[: config.n_owned]
+        for heat in contact.pair.heats if contact.on else ():
+            forces[: len(own)] += config.from_rows(heat.residual())
+    if problem.linear is not None:
+        forces[at] -= problem.linear.forces(problem.linear.multipliers)
+    return forces
+
+
+def owned_displacement(problem: Any) -> Any:
+    """Unknowns of the components of the owned nodes ``(n_owned, gdim)``."""
+    return problem.config.of(np.arange(len(problem.bodies.held)))[: problem.config.n_owned]

@@ -239,17 +239,7 @@ def _move_idle(A: PETSc.Mat, used: Bools) -> None:
 def _solve(
     slepc: Any, problem: UnitedProblem, used: Bools, expand: Callable[[Array], PETSc.Vec], A: PETSc.Mat, B: PETSc.Mat, n: int
 ) -> Vibrations:
-    """Eigenvectors of lowest eigenvalues, as displacements (collective).
-
-    Args:
-        slepc: the module.
-        problem: of the displacements.
-        used: unknowns in use.
-        expand: returns the displacement of owned unknowns.
-        A: stiffness.
-        B: mass.
-        n: number of eigenvectors.
-    """
+    """Eigenvectors of the n lowest eigenvalues, as displacements, which ``expand`` makes of owned unknowns (collective)."""
     comm, V = problem.comm, problem.u.function_space
     stiffness, inertia = A.getDiagonal(), B.getDiagonal()
     moving = int(reduced(comm, int((used & (inertia.array_r > 0.0)).sum())))

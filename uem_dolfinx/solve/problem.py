@@ -29,8 +29,7 @@ from uem_dolfinx.restart.interruption import end_together
 from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.field_scales import Norm
-from uem_dolfinx.solve.loading import check_load, forget_load, ramped, refuse_idle, set_loads, taken_by, values_at
-from uem_dolfinx.solve.reactions import reactions
+from uem_dolfinx.solve.loading import check_load, forget_load, ramped, reactions, refuse_idle, set_loads, taken_by, values_at
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
 from uem_dolfinx.solve.stepping import Progress, hold_others
 from uem_dolfinx.solve.united.newton import ContactMethod, Iteration, solve_united

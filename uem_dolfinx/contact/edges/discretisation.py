@@ -181,12 +181,7 @@ NO_WAY = 1e6
 
 
 class EdgeTarget(MeshTarget):
-    """The edges of a surface, as the target of one list of crossings.
-
-    Args:
-        crossings: all lists.
-        number: of the list.
-    """
+    """The edges of a surface, as the target of one list of crossings, by its number."""
 
     #: Crossings are found from lists, not by bounding boxes.
     measures = False
@@ -199,11 +194,7 @@ class EdgeTarget(MeshTarget):
 
 
 class Edges(OnTarget):
-    """Implements ``Discretisation``: nodes on edges with the edges that cross theirs; arguments as for ``OnTarget``.
-
-    Args:
-        order: see ``Traits``.
-    """
+    """Implements ``Discretisation``: nodes on edges with the edges that cross theirs; as ``OnTarget``, ``order`` as in ``Traits``."""
 
     traits = Traits(at_feet=False, pointwise=False, chained=True, two_pass=True)
     target: EdgeTarget

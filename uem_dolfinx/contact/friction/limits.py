@@ -76,11 +76,7 @@ class Limits:
             self.speed = way / dt
 
     def hold(self, lam: Array | None) -> Array:
-        """Fix the limits at normal forces ``lam (n,)``, as in Tresca's law; None makes them depend on the force again.
-
-        Returns:
-            Largest change of a fixed limit, and the largest limit, on this rank ``(2,)``.
-        """
+        """Fix the limits at normal forces ``lam (n,)``, or not, for None: this rank's largest change, and the largest limit ``(2,)``."""
         before, self._held = self._held, None if lam is None else np.maximum(lam, 0.0)
         if self._held is None:
             return np.zeros(2)

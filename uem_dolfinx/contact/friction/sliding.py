@@ -13,9 +13,8 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
 from uem_dolfinx.contact.friction import stick_slip
-from uem_dolfinx.contact.friction.frame import Frame, anchored, anchors_of, force_times_way, way_since
+from uem_dolfinx.contact.friction.frame import Frame, anchored, anchors_of, force_times_way, way_since, with_friction
 from uem_dolfinx.contact.friction.limits import Limits
-from uem_dolfinx.contact.friction.rows import with_friction
 from uem_dolfinx.contact.friction.stick_slip import LastStep, Pivot
 from uem_dolfinx.contact.laws.law import FrictionLaw, of_rate
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING, Violations
@@ -225,15 +224,7 @@ class Sliding:
         kinematics: Kinematics,
         enter: Callable[[PairState], PairState],
     ) -> PairState:
-        """The state with violated contactors exchanged between stick and slip (collective).
-
-        Args:
-            violated: contactors to be exchanged.
-            state: of the interface.
-            committed: state of the last step.
-            kinematics: of the contactors.
-            enter: function that activates and releases contactors (collective).
-        """
+        """The state with violated contactors exchanged between stick and slip; ``enter`` activates and releases contactors (collective)."""
         assert isinstance(violated, stick_slip.FrictionViolations)
         seen, pivot, share = violated.seen, self.pivot, kinematics.ties.share[:, None]
         tau, slip, lam, forced = seen.tau, seen.slip, seen.lam, violated.driven
@@ -261,13 +252,7 @@ class Sliding:
         return state
 
     def turn(self, state: PairState, kinematics: Kinematics, stiffness: Array) -> PairState:
-        """Begin another linearised problem: slip directions from current positions and the last predicted forces.
-
-        Args:
-            state: of the interface.
-            kinematics: of the contactors.
-            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``.
-        """
+        """Begin another linearised problem: slip directions from current positions and the last predicted forces."""
         frame, none = self.frame, np.zeros((len(self.nodes), self.config.gdim))
         if self.config.gdim == 2:
             self.pivot = Pivot.begin(np.zeros(len(none)), none, none)

@@ -225,13 +225,7 @@ def find_violations(
 
 
 def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> FrictionState:
-    """The state after exchange of violated contactors between stick and slip.
-
-    Args:
-        state: of the contactors.
-        violated: contactors to be exchanged.
-        tau: tangential force ``(n, gdim)``, opposite to the slip direction of contactors that begin to slip.
-    """
+    """The state after exchange of violated contactors between stick and slip, which begins against the force ``tau (n, gdim)``."""
     size = np.linalg.norm(tau, axis=1, keepdims=True)
     direction = np.where(violated.slide[:, None], -tau / np.where(size > 0, size, 1.0), state.direction)
     direction[violated.hold] = 0.0
@@ -239,14 +233,7 @@ def exchange(state: FrictionState, violated: FrictionViolations, tau: Array) -> 
 
 
 def come_and_go(state: FrictionState, before: Bools, now: Bools, frictional: Bools) -> FrictionState:
-    """The state in another active set: new contactors stick, released ones are reset.
-
-    Args:
-        state: of the contactors.
-        before: active so far ``(n,)``.
-        now: active from now on ``(n,)``.
-        frictional: contactors with friction ``(n,)``.
-    """
+    """The state in another active set, masks ``(n,)``: new frictional contactors stick, released ones are reset."""
     stick = (state.stick & now) | (now & ~before & frictional)
     return replace(state, stick=stick, direction=np.where((now & ~stick)[:, None], state.direction, 0.0))
 

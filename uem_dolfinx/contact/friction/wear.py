@@ -92,14 +92,7 @@ class Wear:
         return float(reduced(self._config.comm, float(self._areas @ state.friction.worn)))
 
     def look_at_step(self, before: PairState, now: PairState, normal: Array, stiffness: Array) -> None:
-        """Warn, once, if the wear depth of a step exceeds the elastic recovery of contactors (collective).
-
-        Args:
-            before: state at its start.
-            now: at its end.
-            normal: of the contactors ``(n, gdim)``.
-            stiffness: diagonal of K at the owned nodes ``(n_owned, gdim)``.
-        """
+        """Warn, once, if the wear depth of a step exceeds the elastic recovery of contactors (collective)."""
         if self._warned:
             return
         assert before.friction is not None and now.friction is not None
@@ -117,11 +110,5 @@ class Wear:
 
 
 def worn_volume(k: Array, start: Array, end: Array) -> Array:
-    """Worn volume of a step ``(n,)``: k times the mean of normal force times slip, with the forces at the start and at the end.
-
-    Args:
-        k: wear coefficient over hardness, one over a pressure ``(n,)``.
-        start: normal force at the start of the step times the slip, an energy; tension causes no wear ``(n,)``.
-        end: normal force at the end times the slip ``(n,)``.
-    """
+    """Worn volume ``(n,)``: k times the mean of normal force times slip, an energy, at the start and at the end; tension causes none."""
     return np.asarray(0.5 * k * (np.maximum(start, 0.0) + np.maximum(end, 0.0)))

@@ -30,14 +30,7 @@ def _of_contact(name: str) -> property:
 
 
 class FurtherPart(Contact):
-    """Part of a contact; the contact tells its results.
-
-    Args:
-        of: the contact, attached to a problem.
-        what: for its name.
-        order: see ``Traits``, of all parts of the contact.
-        how: arguments of ``Contact`` in place of those of the contact.
-    """
+    """Part of a contact, with arguments of its own in place of the contact's; ``order`` as in ``Traits``. The contact tells its results."""
 
     is_further_part = True
     #: Corners are contactors themselves, and contactors pass ends regularly.
@@ -68,14 +61,7 @@ class FurtherPart(Contact):
 
 
 class CornerContact(FurtherPart):
-    """Part of a contact: nodes of its target.
-
-    Args:
-        of: the contact, attached to a problem.
-        order: see ``FurtherPart``.
-        nodes: owned nodes of its target ``(n,)``.
-        facets: of its contactor.
-    """
+    """Part of a contact: owned nodes of its target ``(n,)``, against facets of its contactor."""
 
     swaps = True
 
@@ -173,9 +159,7 @@ class EdgeContact(OfCrossings, FurtherPart):
 def edges_of(contact: Contact, config: Configuration, order: int) -> list[EdgeContact]:
     """Parts with the crossings, one for each that a node may have; none in 2D, and unless both surfaces have sharp edges (collective).
 
-    Raises:
-        InputError: for other than finite sliding.
-        OrientationError: for a surface inside a body.
+    InputError for other than finite sliding, OrientationError for a surface inside a body.
     """
     if contact.sliding != "finite":
         raise InputError(f"contact '{contact.name}': edges = True goes with sliding = 'finite': leave one of them out")

@@ -150,7 +150,7 @@ class GeneralContact(OfProblem, given.Sealed):
             TagError, SpaceError, OrientationError: for parts of another kind or mesh, or facets inside a body.
             SurfaceError: if no surfaces are left that may touch, if a body has two names, or if two bodies have the same name.
         """
-        from uem_dolfinx.geometry.skin import Skin
+        from uem_dolfinx.geometry.skin import Skin, names_of_bodies
 
         self.taken, self._attached = True, config
         alone = [one for one in self.exclude if not is_pair(one)]
@@ -160,7 +160,8 @@ class GeneralContact(OfProblem, given.Sealed):
         surface = touching_surface(config, self.surfaces, [as_part(config, part, "exclude") for part in alone])
         self._skin = skin = Skin(config, surface)
         place = skin.order([as_part(config, part, "order") for part in self.order], rigid)
-        self._name_bodies()
+        named = {name: skin.bodies_of(as_part(config, part, "bodies")) for name, part in self.bodies.items()}
+        self._names = names_of_bodies(named, skin.n_bodies)
         nodes = surface_nodes(config, surface)
         bound = MAX_PENETRATION * float(skin.extent.min()) if self.max_penetration is None else self.max_penetration
         friction = self.friction if self._pairs is None else self._pairs.law
@@ -258,12 +259,6 @@ class GeneralContact(OfProblem, given.Sealed):
             return where(self._skin, one, "friction")
         body = self._names.index(given.word("the name of a body in friction", one, self._names))
         return self._skin.body_of_node == body, self._skin.body == body
-
-    def _name_bodies(self) -> None:
-        from uem_dolfinx.geometry.skin import names_of_bodies
-
-        parts = {name: self._skin.bodies_of(as_part(self._config, part, "bodies")) for name, part in self.bodies.items()}
-        self._names = names_of_bodies(parts, self._skin.n_bodies)
 
     @property
     def all_surfaces(self) -> Tag:

@@ -130,11 +130,7 @@ def refuse_words_of_contact(others: Mapping[str, Any]) -> None:
 
 
 def given_edges(edges: bool | None, normal: SoftContact | None, heats: Sequence[Conductance], law: FrictionLaw) -> bool:
-    """Whether edges that cross are held apart.
-
-    Raises:
-        InputError, InputTypeError: if that does not go with the other arguments, or for another value.
-    """
+    """Whether edges that cross are held apart; InputError or InputTypeError if that does not go with the other arguments."""
     others: dict[str, Any] = {"normal": normal}
     others |= {"heat": heats or None, "friction": law if law.per_area else None}
     wrong = {word: value for word, value in others.items() if value is not None}
@@ -147,14 +143,7 @@ def given_edges(edges: bool | None, normal: SoftContact | None, heats: Sequence[
 
 
 def refuse_open_conductance(config: Configuration, name: str, heats: Sequence[Conductance], bound: float) -> None:
-    """Raise InputError for heat flow through gaps, since only facets within reach are searched (collective).
-
-    Args:
-        config: configuration of the displacement.
-        name: of the general contact.
-        heats: conductances.
-        bound: on the initial penetration, a length.
-    """
+    """InputError for heat flow through gaps, since only facets within reach are searched (collective)."""
     gaps, some = bound * np.array([1.0, 1e-2, 1e-4]), np.array([1.0, 1e2, 1e4])
     for law in heats:
         state = (np.zeros(3), gaps, some, 0.5 * some)[: 4 if law.of_temperatures else 2]

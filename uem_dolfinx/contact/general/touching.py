@@ -98,11 +98,7 @@ def _whole_name(one: Any, names: Sequence[str]) -> Any:
 def between(
     pairs: Sequence[Pair], names: Sequence[str], first: str, second: str | None, nothing: Resultant
 ) -> tuple[Resultant, float]:
-    """Force and moment on a body from another one, None for all others, and the power that flows there.
-
-    Raises:
-        InputError: for an unknown name.
-    """
+    """Force and moment on a body from another one, None for all others, and the power that flows there; InputError for other names."""
     first, second = (_whole_name(one, names) for one in (first, second))
     given.word("first", first, names)
     if second is not None:

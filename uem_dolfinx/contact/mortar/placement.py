@@ -220,8 +220,8 @@ class MortarKinematics(PlacedOnTarget):
 
         The areas a are those of the dual functions, b the covered parts of reference areas (collective).
         """
-        from uem_dolfinx.contact.seam.dyads import Terms as Gradients
-        from uem_dolfinx.contact.seam.dyads import dyads
+        from uem_dolfinx.contact.seam.relative_motion import Terms as Gradients
+        from uem_dolfinx.contact.seam.relative_motion import dyads
 
         of, rows, at = self.of, self.rows, self.rows.points
         on_facet, on_target = at.area_derivatives(of.growth(rows.facets, at.x))

@@ -298,9 +298,10 @@ class Elimination:
         row, term, value = variation
         other, direction = term != self._own[row], self.of_themselves(plain, variation)
         by = np.linalg.norm(direction, axis=1)
-        made = with_terms(plain, (row[other], term[other], value[other]))
-        gap, coefficients = plain.gap / by, made.coefficients / by[made.row, None]
-        return replace(made, direction=direction / by[:, None], gap=gap, coefficients=coefficients), by
+        known = (plain.row, plain.followed, plain.coefficients)
+        row, term, value = add_up_terms(known, (row[other], term[other], value[other]))
+        made = replace(plain, row=row, followed=term, coefficients=value / by[row, None])
+        return replace(made, direction=direction / by[:, None], gap=plain.gap / by), by
 
 
 class Remembered:
@@ -352,9 +353,3 @@ def add_up_terms(*parts: Terms) -> Terms:
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     each = order[first]
     return row[each], term[each], sums_of_groups(value, first, order)
-
-
-def with_terms(equations: UnitingEquations, terms: Terms) -> UnitingEquations:
-    """The equations with more terms."""
-    row, term, value = add_up_terms((equations.row, equations.followed, equations.coefficients), terms)
-    return replace(equations, row=row, followed=term, coefficients=value)

@@ -37,8 +37,8 @@ from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, with_averaged_
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Violations
-from uem_dolfinx.contact.seam.dyads import grouped
 from uem_dolfinx.contact.seam.placement import ContactRows, Traction
+from uem_dolfinx.contact.seam.relative_motion import grouped
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.parallel import reduced
 

@@ -24,9 +24,8 @@ from uem_dolfinx.geometry.projection import Projection, Target
 
 if TYPE_CHECKING:
     from uem_dolfinx.contact.seam.corners import Corners
-    from uem_dolfinx.contact.seam.dyads import Terms
     from uem_dolfinx.contact.seam.ends import Ends
-    from uem_dolfinx.contact.seam.relative_motion import Ties
+    from uem_dolfinx.contact.seam.relative_motion import Terms, Ties
 
 #: Kind of an equation along the contact normal; kind r is along the r-th further axis of a corner that holds the contactor.
 #: [format; number of a kind; -]
@@ -204,7 +203,7 @@ class GapRows:
     @property
     def gradients(self) -> Terms:
         """Gradients of the gaps of all equations, as terms of both bodies."""
-        from uem_dolfinx.contact.seam.dyads import Terms
+        from uem_dolfinx.contact.seam.relative_motion import Terms
 
         eq = self.equations
         row, node = np.append(np.arange(len(eq)), eq.row), np.append(self.config.to_global(eq.node), eq.followed)

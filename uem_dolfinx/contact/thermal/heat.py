@@ -23,8 +23,8 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.laws.soft import value
-from uem_dolfinx.contact.seam.dyads import Terms, dyads
 from uem_dolfinx.contact.seam.placement import ContactRows, Discretisation, Kinematics
+from uem_dolfinx.contact.seam.relative_motion import Terms, dyads
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.thermal.sides import Sides, sides_of
 from uem_dolfinx.contact.thermal.sources import FrictionalHeat, JouleHeat, Source

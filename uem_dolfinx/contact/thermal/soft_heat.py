@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools
-from uem_dolfinx.contact.seam.dyads import Terms
+from uem_dolfinx.contact.seam.relative_motion import Terms
 from uem_dolfinx.contact.thermal.heat import Heat
 
 

@@ -11,7 +11,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.laws.conductance import Conductance
 from uem_dolfinx.contact.laws.soft import value
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
-from uem_dolfinx.contact.seam.dyads import Terms
+from uem_dolfinx.contact.seam.relative_motion import Terms
 from uem_dolfinx.errors import InputError
 
 #: Durations of a step that differ by less are one.

@@ -100,7 +100,9 @@ class Preloaded(Tie):
             return
         can = self._free[i, c] & (c == main)
         # rows that contain no other contactor cause no cycles
-        alone = can & ~np.isin(i, rows.terms[0][self._is_contactor(rows.terms[1])])
+        mark = np.zeros((self.config.n_owned, 1))
+        mark[self.nodes] = 1.0
+        alone = can & ~np.isin(i, rows.terms[0][self.config.ask_owners(rows.terms[1], mark)[:, 0] > 0])
         if reduced(comm, bool(alone.any()), op=MPI.LOR):
             can = alone
         X, here = self.config.X[self.nodes[i]], np.flatnonzero(can)
@@ -116,12 +118,6 @@ class Preloaded(Tie):
         nearest = gathered(comm, float(away.min(initial=np.inf)))
         self._root = int(np.argmin(nearest))
         self._lead = int(here[np.argmin(away)]) if comm.rank == self._root else -1
-
-    def _is_contactor(self, nodes: Ints) -> Bools:
-        """Whether these global nodes are contactors of any rank ``(k,)`` (collective)."""
-        mark = np.zeros((self.config.n_owned, 1))
-        mark[self.nodes] = 1.0
-        return np.asarray(self.config.ask_owners(nodes, mark)[:, 0] > 0)
 
     # -- rows ------------------------------------------------------------------------------------------------------------
 

@@ -186,7 +186,7 @@ class TargetCorners:
         # without any contact force every corner inside matters, also in a body without stiffness
         at_corners = (some > 0) & (of_corners >= LACKING * self.largest)
         at_vertices, harmful = of_vertices > LACKING_AT_VERTICES * self.largest, {}
-        for k in np.flatnonzero(at_corners | at_vertices):
+        for k in np.flatnonzero(at_corners | at_vertices).tolist():
             which = np.flatnonzero(inside & (label == k) & (sharp | at_vertices[k]))
             found = [(float(part[i]), config.describe(int(near[i])), float(depth[i])) for i in which]
             everywhere = sorted((one for there in comm.allgather(found) for one in there), reverse=True)
@@ -195,15 +195,10 @@ class TargetCorners:
             size, place, deep = next(one for one in everywhere if one[1] == deepest)
             lacking = of_corners[k] + at_vertices[k] * of_vertices[k]
             missing = lacking / self.largest[k] if self.largest[k] > 0.0 else np.inf
-            both_sides = self._at_own_corners(int(k))
-            harmful[int(k)] = CornerInside(place, deep, size, missing, both_sides, bool(at_vertices[k] and not at_corners[k]))
+            pair, own = self.pairs[k], corner_nodes(config, facets_of(config, self._tags[k], "contactor"))
+            both_sides = bool(reduced(comm, int(np.isin(pair.nodes[pair.trial.active], own).sum())))
+            harmful[k] = CornerInside(place, deep, size, missing, both_sides, bool(at_vertices[k] and not at_corners[k]))
         return harmful
-
-    def _at_own_corners(self, k: int) -> bool:
-        """Whether contactors of a contact at corners or ends of their own surface are active (collective)."""
-        pair, config = self.pairs[k], self._config
-        corners = corner_nodes(config, facets_of(config, self._tags[k], "contactor"))
-        return bool(reduced(config.comm, int(np.isin(pair.nodes[pair.trial.active], corners).sum())))
 
     def _near(self, checked: Bools) -> Ints:
         """Indices of corners inside the box around contactors within one facet size of the target ``(k,)`` (collective)."""

@@ -210,12 +210,9 @@ class Bodies:
         return np.array(self.tangent.K.getDiagonal().array_r).reshape(-1, self.config.block)[: self.config.n_owned]
 
     def rounding(self, positioned: npt.NDArray[np.integer]) -> Any:
-        """Norm of the forces due to rounding of the displacement, and of the positions of some nodes (collective).
+        """Norm of the forces due to rounding of the displacement, and of the positions of nodes, repeated ones repeatedly (collective).
 
         With other fields one norm for each ``(n_fields,)``, from the terms of its equations.
-
-        Args:
-            positioned: owned nodes whose position is rounded, not their displacement alone; repeated ones count repeatedly.
         """
         if self.stiffness is None:
             return 0.0
@@ -242,12 +239,9 @@ class Bodies:
         return np.asarray(FORCE_ROUNDING * forces.max(axis=1, initial=0.0))
 
     def above_rounding(self, positioned: bool) -> Any:
-        """Norm of the forces, or one for each field, at the components where they exceed rounding (collective).
+        """Norm of the forces, or one for each field, at the components where they exceed rounding, also of positions (collective).
 
         Rounding of a body's displacement affects all of its nodes, also nodes with Dirichlet conditions, and bodies that are linked to it.
-
-        Args:
-            positioned: whether positions are rounded, not displacements alone.
         """
         if self.stiffness is None:
             return self.unknowns.norms(self.residual)
@@ -344,11 +338,7 @@ class Bodies:
     # -- displacement --------------------------------------------------------------------------------------------------
 
     def check_displacement(self, facets: float) -> None:
-        """Refuse a displacement that is not finite, or whose rounding exceeds the length of ``facets`` (collective).
-
-        Raises:
-            NotFiniteError: in either case.
-        """
+        """NotFiniteError for a displacement that is not finite, or whose rounding exceeds the length of ``facets`` (collective)."""
         if not np.isfinite(size := self._u.norm()):
             raise NotFiniteError("the displacement holds NaN or infinity: check its initial values and the Dirichlet conditions")
         if np.finfo(float).eps * size <= facets:

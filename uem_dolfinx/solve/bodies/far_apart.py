@@ -90,11 +90,7 @@ class FarApart:
         self._boxes: Boxes
 
     def begin_step(self, falls: bool) -> None:
-        """Decide which contacts are too far away, at the present positions (collective).
-
-        Args:
-            falls: whether bodies fall in statics, since gaps to rigid surfaces then limit their motion.
-        """
+        """Decide which contacts are too far away; if bodies fall in statics, gaps to rigid surfaces limit their motion (collective)."""
         if not self._pairs:
             return
         offsets = [pair.discretisation.setting.offset for pair in self._pairs]

@@ -24,13 +24,7 @@ TRANSLATION_ROUNDING = 4.0 * np.finfo(float).eps
 
 
 def explicit_forces(bodies: Any, form: Any, J: ufl.Form | None) -> Callable[[PETSc.Vec], None] | None:
-    """How linear bodies write their residual F(u) to a vector in explicit steps, where K has no inertia; None for others.
-
-    Args:
-        bodies: with F, tangent, materials, points and dynamics.
-        form: F, compiled.
-        J: tangent of users, or None.
-    """
+    """How linear bodies write their residual F(u), ``form``, to a vector in explicit steps, without inertia in K; None for others."""
     dynamics = bodies.dynamics
     if not is_explicit(dynamics) or dynamics.damping is not None:
         return None
@@ -38,12 +32,7 @@ def explicit_forces(bodies: Any, form: Any, J: ufl.Form | None) -> Callable[[PET
 
 
 class LinearForces:
-    """``F(u) = K u + F(0)`` of bodies, as long as nothing but u changes in F.
-
-    Args:
-        bodies: whose K is constant, and has no inertia.
-        form: F, compiled.
-    """
+    """``F(u) = K u + F(0)`` of bodies whose K is constant and has no inertia, as long as nothing but u changes in F, ``form``."""
 
     def __init__(self, bodies: Any, form: Any):
         self._bodies, self._form = bodies, form

@@ -119,11 +119,7 @@ class FloatingBodies:
         return motions if motions.any_open() else None
 
     def begin_step(self, place: Callable[[], None]) -> None:
-        """Let bodies fall until they touch; ``place`` projects all contactors (collective).
-
-        Raises:
-            FloatingBodyError: names a body and its unrestrained motion.
-        """
+        """Let bodies fall until they touch; ``place`` projects all contactors. FloatingBodyError if they do not (collective)."""
         if self._bodies.dynamics is not None:
             self.motions = self._in_motion if self._bodies.dynamics.moving else self._at_rest
         self._far_apart.begin_step(self.motions is not None)
@@ -147,11 +143,7 @@ class FloatingBodies:
             self.motions = motions
 
     def end_step(self) -> None:
-        """Refuse a state in which supports carry more than rounding; in a time step, warn.
-
-        Raises:
-            FloatingBodyError: in statics.
-        """
+        """Refuse a state in which supports carry more than rounding by a FloatingBodyError; in a time step, warn."""
         if self.motions is None:
             return
         if self._bodies.dynamics is None:
@@ -181,12 +173,7 @@ class FloatingBodies:
             raise motions.thrown(thrown, THROWN * else_)
 
     def hold(self, free: Bools, rows: ContactRows) -> Bools:
-        """Free components ``(n_rows, gdim)`` without the supports that hold neutral motions (collective).
-
-        Args:
-            free: components without Dirichlet condition ``(n_rows, gdim)``.
-            rows: of all pairs, then of users.
-        """
+        """Free components ``(n_rows, gdim)`` without the supports that hold neutral motions; rows of all pairs, then users (collective)."""
         if self.motions is None:
             return free
         equations = rows.stopping
@@ -397,15 +384,11 @@ class FloatingBodies:
         # if no gap closes and no overlap is removed, the motion never stops
         rate, some = R @ v, OPEN * np.abs(v).max()
         if not reduced(comm, bool(((rate < -some) | ((push > 0) & (rate > some))).any()), op=MPI.LOR):
-            if self._look_farther():
+            lists = {id(one): one for pair in self._pairs if (one := getattr(pair.target, "neighbours", None)) is not None}
+            if any([self._far_apart.look_at_all(), *(one.look_farther() for one in lists.values())]):
                 return np.zeros_like(v), took
             raise motions.error(v)
         return v, took
-
-    def _look_farther(self) -> bool:
-        """Search farther from the next placement on: whether this can find more facets (collective)."""
-        lists = {id(one): one for pair in self._pairs if (one := getattr(pair.target, "neighbours", None)) is not None}
-        return any([self._far_apart.look_at_all(), *(one.look_farther() for one in lists.values())])
 
     def _ways(self, R: Any, gap: Array, v: Array) -> Array:
         """Multiple of motions ``v (n_motions,)`` at which the first gap of every body closes ``(count,)`` (collective)."""

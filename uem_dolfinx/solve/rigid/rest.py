@@ -76,16 +76,7 @@ def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any, sy
     """Converge; if bodies without friction that only contact holds do not come to rest, once more by a decaying drag (collective).
 
     Surfaces wear by the forces at both ends of the step (Heun's method): it converges once more on the worn ones, but not along an arc.
-
-    Args:
-        problem: a ``UnitedProblem`` with the values that its Dirichlet conditions prescribe.
-        start: see ``UnitedProblem.attempt``.
-        fraction: likewise.
-        along: likewise.
-        system: likewise.
-
-    Raises:
-        UEMError: of the first attempt, if the drag does not bring them to rest, either.
+    Arguments as of ``UnitedProblem.attempt``; raises as the first attempt, if the drag does not bring them to rest, either.
     """
     converge = partial(problem.converge, problem.bodies, system, start, fraction, along)
     try:

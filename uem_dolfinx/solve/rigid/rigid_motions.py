@@ -135,11 +135,7 @@ class RigidMotions:
         return self._spread(terms, body, np.append(np.arange(len(equations)), equations.row), len(equations))
 
     def open_motions(self, rates: Any | None) -> Any:
-        """Orthonormal motions that neither conditions nor equations resist, a sparse matrix ``(n_motions, k)`` (collective).
-
-        Args:
-            rates: of this rank's equations ``(m, n_motions)`` at the present positions, or None.
-        """
+        """Orthonormal motions that neither conditions nor equations with these ``rates`` resist, sparse ``(n_motions, k)`` (collective)."""
         if self.finite and rates is None:
             self.middle = self._middles()
         if self.finite or self._unheld is None:
@@ -165,13 +161,10 @@ class RigidMotions:
         return (free @ by_block(resisted, least)).tocsc()
 
     def ask_stiffness(self, K: PETSc.Mat) -> None:
-        """Treat motions that K resists, e.g. by springs in a form, as held (collective).
+        """Treat motions that K resists, e.g. by springs in a form, as held, unless K is not finite (collective).
 
         With the modes R of a body and the work D of each on the diagonal of K, these are the eigenvectors of ``D^-1/2 R'KR D^-1/2`` with
         eigenvalues above rounding.
-
-        Args:
-            K: tangent of the bodies; ignored if it is not finite.
         """
         config, unknowns, own = self.config, self.config.unknowns, self._body[: self.config.n_owned]
         modes, size = self._modes(self._places, own), config.n_owned * config.gdim
@@ -210,11 +203,7 @@ class RigidMotions:
         return sums.reshape(self.count, a.shape[1], b.shape[1])
 
     def following(self, prescribed: Array) -> Array:
-        """The motion that follows the Dirichlet conditions by least squares, zero along open motions (collective).
-
-        Args:
-            prescribed: increments of the owned nodes; free components are ignored ``(n_owned, gdim)``.
-        """
+        """The motion that follows increments ``(n_owned, gdim)`` of Dirichlet values by least squares, not along open ones (collective)."""
         if self.finite:
             self.middle = self._middles()
         body, modes, at = self._held()

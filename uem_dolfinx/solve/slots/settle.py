@@ -58,14 +58,7 @@ class _Slots:
 
     @classmethod
     def of(cls, pair: Interface, own: ContactRows, first: int, near: Bools) -> _Slots:
-        """Slots of contactors that may be in contact.
-
-        Args:
-            pair: with its contactors.
-            own: rows of the pair.
-            first: number of the first of them, of all rows.
-            near: rows of contactors that may close their gaps ``(m,)``.
-        """
+        """Slots of contactors of a pair whose rows ``near (m,)`` may close their gaps; ``first`` is the number of its first row."""
         place = np.full((len(pair.nodes), pair.config.gdim), -1, dtype=np.int64)
         rows = np.flatnonzero((own.normal | (own.tangent >= 0)) & own.rows.direction.any(axis=1))
         place[own.contactor[rows], own.tangent[rows] + 1] = rows

@@ -197,11 +197,7 @@ class AlongArc:
         self.tried, self.most, self.longer, self.shorter = 0.0, MOST_STEPS, 2.0, 0.5
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
-        """Take a step from the committed load factor ``done`` and commit it (collective).
-
-        Returns:
-            The load factor and the history of the Newton loop.
-        """
+        """Take a step from the committed load factor ``done`` and commit it: the new factor, and the Newton loop's history (collective)."""
         problem, progress = self._problem, self._problem.progress
         before, self.tried, dissipating = np.array(problem.committed), progress.control.length, 0.0
         bonds = [pair for pair in problem.interfaces if isinstance(pair, SofteningInterface)]

@@ -27,11 +27,7 @@ class ByLoad:
         self._ramped = not callable(problem.load) and (problem.stage is None or problem.stage.step.ramp)
 
     def advance(self, done: float) -> tuple[float, list[Iteration]]:
-        """Take a step from the committed load factor ``done`` and commit it (collective).
-
-        Returns:
-            The load factor and the history of the Newton loop.
-        """
+        """Take a step from the committed load factor ``done`` and commit it: the new factor, and the Newton loop's history (collective)."""
         factor = _next_factor(done, self._problem.progress.control)
         # it may be shorter than the controlled length
         self.tried = factor - done

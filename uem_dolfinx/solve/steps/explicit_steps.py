@@ -30,7 +30,7 @@ from uem_dolfinx.errors import InputError, MassError, StepAccuracyError, UEMErro
 from uem_dolfinx.log import logger
 from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.bodies.tangent import not_finite
-from uem_dolfinx.solve.steps.time_step import TimeStep, events, touching
+from uem_dolfinx.solve.stepping import TimeStep, events, touching
 
 
 class InertBodies(Bodies):
@@ -83,11 +83,7 @@ class InertBodies(Bodies):
 
 
 class StepperWithMass(ExplicitStepper):
-    """Explicit steps of a problem whose contactors have mass; other arguments and methods as for ``ExplicitStepper``.
-
-    Raises:
-        MassError: if a free component has no mass.
-    """
+    """Explicit steps of a problem whose contactors have mass, as ``ExplicitStepper``; MassError if a free component has none."""
 
     def __init__(self, problem: Any):
         super().__init__(problem)

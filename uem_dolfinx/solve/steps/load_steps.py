@@ -12,10 +12,9 @@ from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
+from uem_dolfinx.solve.stepping import LoadStep, begin_checkpoint, between_steps
 from uem_dolfinx.solve.steps.by_load import ByLoad
 from uem_dolfinx.solve.steps.dissipation import Dissipation
-from uem_dolfinx.solve.steps.load_step import LoadStep
 
 if TYPE_CHECKING:
     from uem_dolfinx.restart.checkpoint import Checkpoint

@@ -32,10 +32,9 @@ from uem_dolfinx.errors import CheckpointError, InputError
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 from uem_dolfinx.solve.checks import check_conditions
 from uem_dolfinx.solve.kept import take_multipliers
-from uem_dolfinx.solve.loading import check_load, refuse_idle
+from uem_dolfinx.solve.loading import check_load, owned_displacement, reactions, refuse_idle
 from uem_dolfinx.solve.memory import move_targets
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.reactions import owned_displacement, reactions
 from uem_dolfinx.solve.united.system import BodySystem
 
 

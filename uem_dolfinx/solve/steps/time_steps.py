@@ -22,10 +22,9 @@ from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
-from uem_dolfinx.solve.stepping import begin_checkpoint, between_steps
+from uem_dolfinx.solve.stepping import TimeStep, begin_checkpoint, between_steps, events, touching
 from uem_dolfinx.solve.steps.explicit_steps import explicit_steps
 from uem_dolfinx.solve.steps.load_steps import check_steps
-from uem_dolfinx.solve.steps.time_step import TimeStep, events, touching
 from uem_dolfinx.solve.united.newton import Iteration
 from uem_dolfinx.solve.united.system import CLOSED
 

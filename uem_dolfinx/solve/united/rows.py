@@ -296,7 +296,8 @@ def make_rows(
     if whole.tilt is not None:
         test, last = over_constraints.parted(whole.Q)
         if independent is not None and independent.found:
-            independent = _rotated(pairs, independent, test)
+            independent = independent.rotated(test)
+            _refuse_wedged(pairs, test, independent.undetermined)
             test = independent.equations
         try:
             rotated = Restriction(Q.space, joined(test, last, g), free, prescribed, Q.stacked, like=Q)
@@ -379,13 +380,6 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
         last = rows.rigid.beside(last, rows.whole.Q.select(np.arange(len(rows.whole)) < len(lam)), lam)
     known = dict(zip(map(id, rows.pairs), found))
     return [known.get(id(pair)) or pair.traction for pair in pairs], np.append(lam[start:], last)
-
-
-def _rotated(pairs: Sequence[Interface], independent: IndependentEquations, test: UnitingEquations) -> IndependentEquations:
-    """Equations that conflicted, rotated where contactors slip; FrictionError if they no longer determine a contactor's motion."""
-    rotated = independent.rotated(test)
-    _refuse_wedged(pairs, test, rotated.undetermined)
-    return rotated
 
 
 def in_turns(pair: Interface) -> list[Ints]:
