@@ -40,7 +40,7 @@ class Blocks(NamedTuple):
 
 def together(*parts: Blocks) -> Blocks:
     """The sum of matrices, as a list."""
-    return Blocks(*(np.concatenate(arrays) for arrays in zip(*parts)))
+    return Blocks(*map(np.concatenate, zip(*parts)))
 
 
 def product(A: Blocks, B: Blocks) -> Blocks:

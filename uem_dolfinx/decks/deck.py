@@ -36,10 +36,9 @@ from uem_dolfinx.parallel import reduced
 from uem_dolfinx.scripting import dirichlet, ds, dx
 from uem_dolfinx.solve.modes import Vibrations, modes
 from uem_dolfinx.solve.problem import UnitedProblem
-from uem_dolfinx.solve.stepping import LoadStep
+from uem_dolfinx.solve.stepping import LoadStep, TimeStep
 from uem_dolfinx.solve.steps.load_steps import load_steps
 from uem_dolfinx.solve.steps.stages import Step as OfUsers
-from uem_dolfinx.solve.stepping import TimeStep
 from uem_dolfinx.solve.steps.time_steps import time_steps
 
 #: Kinds of strains by the first letters of element types.

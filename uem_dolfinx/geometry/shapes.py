@@ -131,7 +131,7 @@ class FacetShape:
     def at_middle(self, n: int) -> Tabulated:
         """Shape functions at the middles of n facets (a read-only view)."""
         tab = self._at_middle
-        return Tabulated(*(np.broadcast_to(values, (n, *values.shape[1:])) for values in (tab.N, tab.dN, tab.ddN)))
+        return Tabulated(*[np.broadcast_to(values, (n, *values.shape[1:])) for values in (tab.N, tab.dN, tab.ddN)])
 
     @cached_property
     def _at_middle(self) -> Tabulated:

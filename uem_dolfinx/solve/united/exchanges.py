@@ -177,12 +177,8 @@ class Exchanges:
         if climbs and not self.straight:
             self.straight = True
             return [w.among(np.zeros_like(w.enter)) for w in violated]
-        own = (
-            sum(w.count for w in violated),
-            sum(int(w.enter.sum()) for w in violated),
-            sum(int(pair.trial.active.sum()) for pair in self._pairs),
-            sum(len(p.nodes) for p in self._pairs),
-        )
+        both = zip(violated, self._pairs)
+        own = np.sum([(w.count, w.enter.sum(), pair.trial.active.sum(), len(pair.nodes)) for w, pair in both], axis=0)
         told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
         (number, entering, active, every), state = told[:, :4].sum(axis=0), tuple(told[:, 4])
         self.again = False

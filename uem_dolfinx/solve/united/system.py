@@ -161,7 +161,7 @@ class BodySystem:
     def residual(self) -> PETSc.Vec:
         """Forces of the bodies minus loads of contacts and friction that is independent of the normal force (collective)."""
         F = self.bodies.residual
-        for nodes, forces in filter(None, (*known_forces(self.near), *(pair.applied_forces() for pair in self.near))):
+        for nodes, forces in filter(None, [*known_forces(self.near), *[pair.applied_forces() for pair in self.near]]):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
         F.array[:] += sum(heat.residual() for heat in self._heats)
         return F
