@@ -137,15 +137,7 @@ def body_sums(comm: MPI.Comm, values: Array, body: Ints, count: int) -> Array:
 
 
 def carried_along(nodes: Nodes, body: Ints, count: int, before: Array, now: Array) -> Array:
-    """Where nodes would be had each body moved as one since ``before``, as far as it has, but rigidly ``(n_local, gdim)`` (collective).
-
-    Args:
-        nodes: the nodes.
-        body: of each local node ``(n_local,)``.
-        count: of bodies.
-        before: where nodes were ``(n_local, gdim)``.
-        now: where they are.
-    """
+    """Where nodes ``(n_local, gdim)`` would be had each body moved as one since ``before``, as far as it has, but rigidly (collective)."""
     own, g = slice(nodes.n_owned), before.shape[1]
 
     def means(values: Array) -> Array:

@@ -128,12 +128,7 @@ class RankBoxes:
         self.low, self.high = low - more, high + more
 
     def nearest(self, points: Array, kind: Ints | None = None) -> Ints:
-        """The rank that seems nearest to each point: of those with the nearest box that whose box ends first ``(n,)``.
-
-        Args:
-            points: ``(n, gdim)``.
-            kind: see ``near``.
-        """
+        """The rank that seems nearest to each point ``(n, gdim)``: of those with the nearest box that whose box ends first ``(n,)``."""
         first = np.zeros(len(points), np.int64)
         near, far = np.full((2, len(points)), np.inf)
         about = _Group(self, points, kind)

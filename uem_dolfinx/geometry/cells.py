@@ -46,18 +46,7 @@ def check_nodes(cell: str, cells: Ints, points: Array, label: str, numbers: Ints
 
 
 def check_edges(cell: str, cells: Ints, points: Array, label: str, numbers: Ints | None = None) -> None:
-    """Refuse edges of cells of degree 2 with two different middle nodes, or with the middle node of another edge.
-
-    Args:
-        cell: see ``check_nodes``, also for the other arguments.
-        cells: nodes of each cell in DOLFINx's order ``(n, m)``.
-        points: positions of nodes.
-        label: of the file.
-        numbers: of the cells.
-
-    Raises:
-        MeshError: naming a cell with such an edge.
-    """
+    """MeshError for an edge of degree 2 with two middle nodes or that of another edge, in DOLFINx's order; as ``check_nodes``."""
     topology = forms.reference_topology(cell)
     n_vertices, edges = len(topology[0]), np.array(topology[1])
     if cells.shape[1] == n_vertices:
@@ -77,19 +66,7 @@ def check_edges(cell: str, cells: Ints, points: Array, label: str, numbers: Ints
 
 
 def check_volumes(cell: str, degree: int, cells: Ints, points: Array, label: str, numbers: Ints | None = None) -> None:
-    """Refuse flat cells.
-
-    Args:
-        cell: see ``check_nodes``.
-        degree: of the geometry.
-        cells: nodes of each cell in DOLFINx's order ``(n, m)``.
-        points: see ``check_nodes``.
-        label: see ``check_nodes``.
-        numbers: see ``check_nodes``.
-
-    Raises:
-        MeshError: for a cell whose volume is zero relative to its size.
-    """
+    """MeshError for a cell, in DOLFINx's order, whose volume is zero relative to its size; other arguments as in ``check_nodes``."""
     flat: Bools = np.zeros(cells.shape, dtype=bool)
     flat[:, 0] = flat_cells(cell, degree, cells, points)
     what = "no area" if len(forms.reference_topology(cell)) == 3 else "no volume"

@@ -149,11 +149,7 @@ class Configuration(Nodes):
             u[:] = kept
 
     def modes(self, centred: bool = False) -> Array:
-        """Translations and linearised rotations of the current configuration at the owned nodes ``(n_owned, n_modes, gdim)``.
-
-        Args:
-            centred: whether rotations are about the middle of all nodes, and scaled like translations (collective if so).
-        """
+        """Translations and linearised rotations ``(n_owned, n_modes, gdim)``; ``centred`` about the middle of all nodes and scaled."""
         x = self.x[: self.n_owned]
         if centred:
             x = (x - reduced(self.comm, x.sum(axis=0)) / self.index_map.size_global) / self.size

@@ -303,14 +303,7 @@ class SharpEdges:
 
 
 def find_crossing(own: SharpEdges, theirs: SharpEdges, keys: tuple[Ints, Ints], meet: Any) -> Crossing | None:
-    """The deepest crossing of edges of two surfaces, which may be identical; None without crossing (collective).
-
-    Args:
-        own: edges of one surface.
-        theirs: edges of the other.
-        keys: visibility keys of the edge segments of both ``(k, m)``.
-        meet: function of two arrays of keys ``(n, m)`` that returns whether segments may meet ``(n,)``.
-    """
+    """The deepest crossing of edges of two surfaces, or of one, whose visibility ``keys`` may ``meet``; None without (collective)."""
     comm = own.facets.config.comm
     (x, n), (y, m) = own.now(), theirs.now()
     (c, r), (d, q) = (_balls(z) for z in (x, y))

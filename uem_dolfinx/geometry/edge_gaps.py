@@ -27,12 +27,9 @@ LONGEST_STEP = 1.0
 
 
 def cubics(before: Array, length: Array, after: Array) -> Array:
-    """Coefficients of ``1, s, s^2, s^3`` in the weights of four nodes ``(k, 4, 4)``, with ``s = 0`` and ``1`` at the two in the middle.
+    """Coefficients of ``1, s, s^2, s^3`` in the weights of four nodes ``(k, 4, 4)``, with ``s = 0`` and ``1`` at the middle ones.
 
-    Args:
-        before: lengths from the first node to the second ``(k,)``; infinite if the line ends at the second.
-        length: lengths from the second to the third ``(k,)``.
-        after: lengths from the third to the fourth; infinite if the line ends at the third.
+    The three lengths ``(k,)`` are those between them; the first or the last is infinite if the line ends at a middle node.
     """
     k = len(length)
     # slopes over the length of the piece at its ends

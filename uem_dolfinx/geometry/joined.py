@@ -164,12 +164,7 @@ class JoinedTarget(MeshTarget):
 
 
 class JoinedMotion:
-    """Motions of several rigid surfaces, with the methods of ``Motion`` for the points of all of them.
-
-    Args:
-        each: motions of the surfaces; None for surfaces that have not moved.
-        rows: points of each surface.
-    """
+    """Motions of several rigid surfaces, None if not moved, with the methods of ``Motion`` for their points, the ``rows`` of each."""
 
     def __init__(self, each: Sequence[Motion | None], rows: Sequence[slice]):
         self.each, self._rows = list(each), rows
@@ -207,12 +202,7 @@ class JoinedMotion:
 
 
 class JoinedRigid:
-    """Implements ``Target``: rigid surfaces of many contacts, each met by its own contactors.
-
-    Args:
-        targets: of the contacts.
-        rows: contactors of each.
-    """
+    """Implements ``Target``: rigid surfaces of many contacts, each met by its own contactors, the ``rows`` of each."""
 
     n_nodes, averaged, faceted = 0, False, False
     dofs: Indices = np.zeros((0, 0), np.int32)

@@ -170,14 +170,7 @@ def _beyond(points: Array, values: Array) -> tuple[Array, Array]:
 
 
 def graded(vertices: Ints, count: int, points: Array, sizes: Array) -> Array:
-    """Sizes at the vertices of cells ``(m, k)``, which grow slowly from the smallest ones.
-
-    Args:
-        vertices: of every cell ``(m, k)``.
-        count: number of all vertices.
-        points: of the vertices of every cell ``(m, k, gdim)``.
-        sizes: of every cell ``(m,)``.
-    """
+    """Sizes at the vertices of cells ``(m, k)``, from those of cells ``(m,)``, which grow slowly from the smallest ones."""
     k = vertices.shape[1]
     logs = np.bincount(vertices.ravel(), np.repeat(np.log(sizes), k), count)
     at = np.exp(logs / np.bincount(vertices.ravel(), minlength=count))

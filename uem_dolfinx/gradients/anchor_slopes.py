@@ -31,11 +31,7 @@ BEYOND = "edge of the target is nearest to"
 
 
 def refuse_some(pair: Interface, which: Bools, words: str) -> None:
-    """Refuse contactors of an interface through which there are no derivatives ``(n,)`` (collective).
-
-    Raises:
-        InputError: names a contact, and says what holds them.
-    """
+    """InputError, which says what holds them, for contactors ``which (n,)`` through which there are no derivatives (collective)."""
     count = int(reduced(pair.config.comm, int(which.sum())))
     if count:
         names = pair.config.comm.allgather([name_at(pair, i) for i in np.flatnonzero(which)[:1]])
@@ -139,13 +135,7 @@ class AnchorSlopes:
         return self._anchor.shape[1]
 
     def by_anchors(self, by_gaps: Array, equations: ContactRows, a: Array) -> Array:
-        """Derivative by the anchors ``(n, k)`` (collective).
-
-        Args:
-            by_gaps: derivative by the gaps of the pair's ``equations (m,)``.
-            equations: of the pair.
-            a: adjoint displacement at the owned nodes ``(n_owned, gdim)``.
-        """
+        """Derivative by the anchors ``(n, k)`` from that by the gaps of the equations, and the adjoint displacement (collective)."""
         pair, kinematics, n = self._pair, self._pair.kinematics, len(self._pair.nodes)
         pulled = np.zeros((n, self._config.gdim))
         np.add.at(pulled, equations.contactor, -by_gaps[:, None] * equations.P.direction)
@@ -213,14 +203,7 @@ class AnchorSlopes:
         return v if back else across(v)
 
     def pushed(self, moved: Array, equations: ContactRows) -> tuple[Array, Array]:
-        """Changes of the gaps of the pair's ``equations (m,)`` and of the residual ``(n_owned, gdim)`` with initial anchors (collective).
-
-        The transpose of ``by_anchors``.
-
-        Args:
-            moved: changes of the anchors ``(n, k)``, NaN where they have no derivative.
-            equations: of the pair.
-        """
+        """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` with the anchors ``(n, k)``, or NaN: transpose of ``by_anchors``."""
         pair, kinematics, config = self._pair, self._pair.kinematics, self._config
         needed = self.stuck | (self._slips & (config.gdim == 3))
         refuse_some(self._pair, needed & np.isnan(moved).any(axis=1), BEYOND)

@@ -54,10 +54,9 @@ class Users:
         return any(m is one for one in self._known)
 
     def changes(self, m: fem.Constant, change: Array) -> tuple[Array, Array]:
-        """Changes of the gaps of users' equations ``(k,)``, and of the residual at the owned nodes ``(n_owned, gdim)`` (collective).
+        """Changes of the gaps of users' equations ``(k,)`` and of the residual ``(n_owned, gdim)`` (collective).
 
-        Raises:
-            InputError: for a value that is ramped from a displacement that depends on earlier steps.
+        InputError for a value that is ramped from a displacement that depends on earlier steps.
         """
         problem, pushed = self._problem, np.zeros((self._problem.config.n_owned, self._problem.config.gdim))
         if problem.bodies.tangent.points is not None:

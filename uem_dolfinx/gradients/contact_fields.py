@@ -37,11 +37,7 @@ def fields_of(problem: UnitedProblem) -> list[Any]:
 
 
 def check_field(problem: UnitedProblem, what: str, m: fem.Function) -> None:
-    """Refuse a Function of contacts by which there are no derivatives (to be agreed on).
-
-    Raises:
-        InputError: names the contact.
-    """
+    """InputError for a Function of contacts by which there are no derivatives (to be agreed on)."""
     for contact in problem.contacts:
         called, pair = f"{what}, '{m.name}', of contact '{contact.name}'", contact.pair
         rubs, thickens = as_law(contact.friction).field is m, contact.offset is m
@@ -185,13 +181,7 @@ class PressureSlopes:
         return PressureWeights(np.where(eq.normal, every[eq.contactor], 0.0), areas, now, drawn)
 
     def along(self, multipliers: Array, du: fem.Function, shape: fem.Function) -> Array:
-        """Changes of the pressures of this rank's contactors ``(n,)`` (collective).
-
-        Args:
-            multipliers: changes of the multipliers of the equations ``(m,)``.
-            du: change of the displacement, and of all other fields.
-            shape: change of the reference positions of the nodes, in the displacement's space.
-        """
+        """Changes of the pressures of this rank's contactors ``(n,)`` with multipliers ``(m,)``, all fields and the shape (collective)."""
         config, nodes, p = self._config, self._pair.nodes, self._pressures
         lam, areas = self._whole.forces(self._equations, multipliers).lam[self._rows], np.zeros(len(nodes))
         if self.contact.contactor.dim > 0:

@@ -196,11 +196,7 @@ class Linearised:
         self.problem.restore()
 
     def pressures(self, contact: Contact) -> PressureSlopes:
-        """Derivatives of a contact's pressures (collective).
-
-        Raises:
-            InputError: if they do not exist.
-        """
+        """Derivatives of a contact's pressures; InputError if they do not exist (collective)."""
         if self.rows.conflict:
             raise InputError(
                 f"contact '{contact.name}': equations of contactors conflict with each other or with Dirichlet conditions, and have been "

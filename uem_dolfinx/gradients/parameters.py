@@ -197,11 +197,7 @@ def _sliding(pair: Interface) -> Sliding:
 
 
 def refuse_assembly(problem: UnitedProblem, recorded: bool) -> None:
-    """Refuse features through which there are no derivatives, by one step or, if ``recorded``, by all steps (to be agreed on).
-
-    Raises:
-        InputError: names the feature.
-    """
+    """InputError for features without derivatives, by one step or, if ``recorded``, by all steps (to be agreed on)."""
     for contact in problem.contacts:
         section = contact if isinstance(contact, Preload) else None
         if contact.tied == "after" and (recorded or contact.pair.tie is None or contact.pair.tie.rows is not None):

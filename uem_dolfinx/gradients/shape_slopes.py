@@ -214,12 +214,7 @@ def of_couplings(config: Configuration, users: UserRows) -> list[RigidSlopes]:
 
 
 def shape_slopes_of(problem: UnitedProblem, equations: Sequence[ContactRows]) -> list[tuple[slice, ShapeSlopes | RigidSlopes]]:
-    """Of all ties, linear equations and couplings of a problem, each with its place among the equations of contacts and users (collective).
-
-    Args:
-        problem: in the state of the derivatives.
-        equations: of each of its interfaces.
-    """
+    """Of all ties, linear equations and couplings, each with its place among the equations of contacts and users (collective)."""
     found, first = list[tuple[slice, ShapeSlopes | RigidSlopes]](), 0
     for pair, own in zip(problem.interfaces, equations):
         if pair.tie is not None and pair.tie.rows is not None and pair.trial.bond is not None:
@@ -239,11 +234,7 @@ def shape_slopes_of(problem: UnitedProblem, equations: Sequence[ContactRows]) ->
 
 
 class Followers:
-    """Equations in which motions of rigid parts have taken the place of eliminated components.
-
-    Args:
-        rows: all equations, those of rigid couplings last.
-    """
+    """Equations, those of couplings last, in which motions of rigid parts have taken the place of eliminated components."""
 
     def __init__(self, config: Configuration, rows: Rows):
         self._config, self._rigid = config, rows.rigid

@@ -219,8 +219,7 @@ class Sweep:
 def place_at_start(problem: UnitedProblem, controls: Sequence[AnyControl]) -> None:
     """Place the contacts of a problem that is set to the start of its motion (collective).
 
-    Raises:
-        InputError: for parameters of rigid targets that contactors touch then, and that so affect the first acceleration.
+    InputError for parameters of rigid targets that contactors touch then, and that so affect the first acceleration.
     """
     assert isinstance(problem.system, BodySystem)
     problem.system.place()

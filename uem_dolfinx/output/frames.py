@@ -242,11 +242,7 @@ def vertex_cells(mesh: Any) -> tuple[Ints, Ints]:
 
 
 def boundary(mesh: Any, surface: Part | None = None) -> Ints:
-    """Owned exterior facets, optionally only of a part, by d.o.f. of the P1 space (collective).
-
-    Returns:
-        Vertices in their order around each facet ``(n, n_vertices)``.
-    """
+    """Owned exterior facets, or those of a part, by d.o.f. of the P1 space, in order around each ``(n, n_vertices)`` (collective)."""
     return boundary_and_cells(mesh, surface)[0]
 
 

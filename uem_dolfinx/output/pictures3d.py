@@ -86,19 +86,7 @@ class Solid:
 
 
 def images(faces: Ints, solids: Sequence[Solid], look: Look) -> list[Array]:
-    """One image of a surface for each state, all from the same place and of the same size.
-
-    Args:
-        faces: vertices in their order around each facet ``(n, 3 or 4)``.
-        solids: the states.
-        look: their common options.
-
-    Returns:
-        Images ``(height, width, 4)``, with their margins cut off.
-
-    Raises:
-        InputError: if nothing is in the window.
-    """
+    """Images ``(height, width, 4)`` of all states, from the same place, without margins; InputError if nothing is in the window."""
     with quiet():
         found = [_image(faces, solid, look) for solid in solids]
     return without_margins(found)
