@@ -143,6 +143,13 @@ def test_a_step_that_fails_leaves_its_loads():
     assert abs(float(block.y.value) - 0.5 * SIZE) <= 1e-15
 
 
+@pytest.mark.parametrize("value", [0.5, np.zeros(2)])
+def test_a_function_that_returns_its_value(value):
+    """One function for all loads sets them itself: what it returns would be lost."""
+    block = Block("term", load=lambda b: lambda s: value)
+    refused(uem.InputError, ("the result of load(0)", "returns none", "{constant: function}"), block.problem.solve)
+
+
 def test_a_constant_that_nothing_follows():
     """It is refused by name; what a form, condition, equation, coupling, point, contact or function holds is not."""
     free = fem.Constant(Block("term").u.function_space.mesh, 0.0)

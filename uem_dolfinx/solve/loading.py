@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Number
 from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -42,15 +43,17 @@ class ByFunction:
         last: argument of its last call, or None.
     """
 
-    def __init__(self, function: Callable[[float], None]):
+    def __init__(self, function: Callable[[float], Any]):
         self._function = function
         self.at: float | None = None
         self.last: float | None = None
 
     def __call__(self, at: float) -> None:
-        """Set the load."""
+        """Set the load; InputError for a function that returns a value, which would be lost."""
         self.at = self.last = at
-        self._function(at)
+        if isinstance(value := self._function(at), Number | np.ndarray):
+            words = "a function that sets values itself and returns none, or {constant: function}"
+            raise InputError(given.sentence(f"the result of load({at:.6g})", value, words))
 
 
 def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
