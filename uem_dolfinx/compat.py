@@ -169,6 +169,9 @@ def space_of(domain: Any, element: Any) -> Any:
 
 @kept()
 def _space(domain: Any, family: str, degree: int, shape: tuple[int, ...]) -> Any:
+    if DOLFINX_VERSION < (0, 7) and family == "DG" and degree and cell_name(domain) in ("quadrilateral", "hexahedron"):
+        # UFL would warn that it takes this one
+        family = "DQ"
     if hasattr(fem, "functionspace") or shape == ():
         return space_of(domain, (family, degree, shape) if shape else (family, degree))
     if len(shape) == 1:

@@ -14,7 +14,7 @@ import ufl
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.accuracy.enriched import narrow_contacts
-from uem_dolfinx.accuracy.estimate import FEWEST, UNRESOLVED, ErrorEstimate, estimated
+from uem_dolfinx.accuracy.estimate import FEWEST, UNRESOLVED, WAYS, By, ErrorEstimate, estimated
 from uem_dolfinx.accuracy.goal import GoalError, goal_error
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.errors import ConvergenceError, InputError, MeshError
@@ -192,6 +192,7 @@ def adapt(
     tolerance: float | None = None,
     cells: int | None = None,
     goal: Callable[[UnitedProblem], ufl.Form] | None = None,
+    by: By = "residual",
     solve: Callable[[UnitedProblem], Any] | None = None,
     solve_again: Callable[[UnitedProblem], Any] | None = None,
     meshes: int = 10,
@@ -208,6 +209,7 @@ def adapt(
         cells: or the number of cells, which are spent where they serve most.
         goal: returns a functional of a problem's displacement, of which the error over its value is estimated instead, see ``goal_error``.
             Its parts of all cells, without their signs, are at most ``MOST_CANCELLED`` times the tolerance on the last mesh.
+        by: what the error in the energy norm is estimated by, see ``error_estimate``.
         solve: solves a problem, e.g. ``lambda problem: list(uem.load_steps(problem, 10))``; by default in one load step.
         solve_again: solves the problem of every mesh after the first, which begins with the displacement of the mesh before,
             e.g. ``lambda problem: problem.solve()``, at the full load at once. The solution must not depend on the path; where it
@@ -239,6 +241,8 @@ def adapt(
         given.kind(name, one, one is None or given.function(one), "a function of the problem, or None")
     if (tolerance is None) == (cells is None):
         raise InputError("adapt: expected either a tolerance or a number of cells")
+    if given.word("by", by, WAYS) != "residual" and goal is not None:
+        raise InputError(f"adapt: errors of a goal are estimated by the residual; by = '{by}' expects no goal")
     tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))
     cells = None if cells is None else given.count("cells", cells)
     meshes = given.count("meshes", meshes)
@@ -250,7 +254,7 @@ def adapt(
     while True:
         start = perf_counter()
         problem, steps = _solved(make, size, solve, problem, solve_again)
-        estimate = estimated(problem) if goal is None else goal_error(problem, goal(problem))
+        estimate = estimated(problem, by) if goal is None else goal_error(problem, goal(problem))
         if np.isnan(estimate.relative):
             raise InputError(
                 f"adapt: the {'displacement' if goal is None else 'goal'} is zero on mesh {len(found) + 1}, to rounding, and its error is "

@@ -115,7 +115,6 @@ class Enriched:
         forces: residual of the bodies without contacts, at the owned nodes of W, zero at prescribed components ``(n, gdim)``.
         residual: the same with the contact tractions.
         traction: of contacts, in the displacement's space; None without contact surfaces.
-        energy: ``u' K u`` of the displacement.
     """
 
     def __init__(self, problem: UnitedProblem):
@@ -128,17 +127,7 @@ class Enriched:
         self.held = self._held()
         differentiate(problem.materials)
         F, test, trial = bodies.F, bodies.F.arguments()[0], ufl.TrialFunction(self.W)
-
-        def stiffness(along: Any, of: Any) -> Any:
-            J = ufl.derivative(ufl.replace(F, {test: of}), config.whole, along)
-            for material in problem.materials:
-                J += revolved(material.stiffness(along, of))
-            return forms.form(forms.with_derivatives(J)[0])
-
-        self._stiffness = stiffness(trial, self.test)
-        # the same displacement, of which nothing is a derivative
-        fixed = config.whole.copy()
-        self.energy = abs(forms.assemble_scalar(stiffness(fixed, fixed), config.comm))
+        self._stiffness = forms.form(forms.with_derivatives(stiffness_form(problem, trial, self.test))[0])
         self.forces = self.residual = self.assembled(ufl.replace(F, {test: self.test}))
         self.traction = None
         if (found := contact_tractions(problem)) is not None:
@@ -233,6 +222,25 @@ class Enriched:
         of_solution = compat.cell_dofs(problem.config.u.function_space)
         found[self.cells[:, :vertices]] |= held[of_solution[:, :vertices]]
         return found
+
+
+def stiffness_form(problem: UnitedProblem, along: Any, test: Any) -> ufl.Form:
+    """The tangent of a problem's bodies along a trial function or displacement, with a test function or displacement."""
+    F = problem.bodies.F
+    J = ufl.derivative(ufl.replace(F, {F.arguments()[0]: test}), problem.config.whole, along)
+    for material in problem.materials:
+        J += revolved(material.stiffness(along, test))
+    return J
+
+
+def energy(problem: UnitedProblem) -> float:
+    """``u' K u`` of the displacement, with the tangent K (collective)."""
+    config = problem.config
+    # the same displacement, of which nothing is a derivative; other fields are zero
+    fixed, moving = fem.Function(config.whole.function_space), config.of(np.arange(len(config.whole.x.array)))
+    fixed.x.array[moving] = config.whole.x.array[moving]
+    form = forms.form(forms.with_derivatives(stiffness_form(problem, fixed, fixed))[0])
+    return abs(forms.assemble_scalar(form, config.comm))
 
 
 class FewFacets(NamedTuple):

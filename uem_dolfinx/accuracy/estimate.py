@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
 
 from mpi4py import MPI
 
@@ -10,7 +11,7 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx import compat, given
-from uem_dolfinx.accuracy.enriched import Enriched, FewFacets, narrow_contacts, warn_of_few_facets
+from uem_dolfinx.accuracy.enriched import Enriched, FewFacets, energy, narrow_contacts, warn_of_few_facets
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.bodies import bodies_in_order, body_sums
@@ -26,9 +27,13 @@ FEWEST = 2
 UNRESOLVED = 5.0
 
 
+By: TypeAlias = Literal["residual", "recovery"]
+WAYS: tuple[By, ...] = ("residual", "recovery")
+
+
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """An estimate of the error of the displacement by the mesh, in the energy norm ``sqrt(e' K e)``.
+    """An estimate of the error by the mesh, in the energy norm ``sqrt(e' K e)`` of displacements or the same norm of stresses.
 
     Attributes:
         total: of all bodies, the root of a work.
@@ -61,22 +66,25 @@ class ErrorEstimate:
         return f"error by the mesh: {100 * self.relative:.3g} %"
 
 
-def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
+def error_estimate(problem: UnitedProblem, by: By = "residual") -> ErrorEstimate:
     """Estimate the error of a solution by its mesh (collective).
 
-    The residual of the solution is evaluated in a space of one degree more, with the contact tractions on both sides; see
-    ``accuracy.enriched``. Any law, with history too, large strain and sliding, friction, and both couplings are included. The
+    By default the residual of the solution is evaluated in a space of one degree more, with the contact tractions on both sides; see
+    ``accuracy.enriched``. By recovery the stress is compared with polynomials that are fitted to it in patches of cells; see
+    ``accuracy.recovered``. Any law, with history too, large strain and sliding, friction, and both couplings are included. The
     estimate is of the last step alone; errors of earlier steps in a history, and of steps of time, are not included. It warns where
     fewer than ``FEWEST`` facets are in contact along a direction: the error may then be ``UNRESOLVED`` times as large.
 
     Args:
-        problem: in statics, in equilibrium, as ``solve`` or a step leaves it.
+        problem: in equilibrium, as ``solve`` or a step leaves it; in statics for ``"residual"``.
+        by: ``"residual"``; or ``"recovery"``, which needs the stress alone, so that dynamics, mixed fields and equations are included.
 
     Returns:
         The estimate, in total, by body and by cell.
 
     Raises:
-        InputError, InputTypeError: for other objects, dynamics, mixed or scalar fields, or equations between nodes.
+        InputError, InputTypeError: for other objects and scalar fields; by the residual for dynamics, mixed fields, or equations
+            between nodes; by recovery where a body has too few cells.
 
     Example:
         ::
@@ -86,43 +94,53 @@ def error_estimate(problem: UnitedProblem) -> ErrorEstimate:
             print(estimate)
             uem.plot_scene(problem, field=estimate.cells)
     """
-    estimate = estimated(problem)
+    estimate = estimated(problem, by)
     warn_of_few_facets(estimate.narrow, f"the error may be {UNRESOLVED:g} times the estimate")
     return estimate
 
 
-def estimated(problem: UnitedProblem) -> ErrorEstimate:
+def estimated(problem: UnitedProblem, by: By = "residual") -> ErrorEstimate:
     """As ``error_estimate``, without its warning (collective)."""
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
-        refuse_estimate(problem)
+        given.word("by", by, WAYS)
+        refuse_estimate(problem, by)
     config = problem.config
     with timed("estimate errors"):
-        enriched = Enriched(problem)
-        squared = enriched.energies()
+        if by == "residual":
+            squared = Enriched(problem).energies()
+        else:
+            from uem_dolfinx.accuracy.recovered import Recovered
+
+            squared = Recovered(problem).energies()
         body, count = bodies_in_order(config)
         of_cells = body[compat.cell_dofs(config.V)[: len(squared), 0]]
         sums = body_sums(config.comm, squared[:, None], of_cells, count)[:, 0]
         cells = fem.Function(compat.function_space(config.mesh, ("DG", 0)), name="error_estimate")
         cells.x.array[: len(squared)] = np.sqrt(squared)
         cells.x.scatter_forward()
-    total, norm = float(np.sqrt(sums.sum())), float(np.sqrt(enriched.energy))
+    total, norm = float(np.sqrt(sums.sum())), float(np.sqrt(energy(problem)))
     return ErrorEstimate(total, norm, np.sqrt(sums), cells, squared, narrow_contacts(problem, FEWEST))
 
 
-def refuse_estimate(problem: UnitedProblem) -> None:
-    """Refuse problems whose residual is more than a form of the displacement, or not in equilibrium."""
+def refuse_estimate(problem: UnitedProblem, by: By = "residual") -> None:
+    """Refuse problems without a stress, and by the residual those whose residual is more than a form of the displacement."""
+    alone = by == "residual"
     for present, what in (
-        (not problem.config.moves or problem.config.unknowns.mixed, "other fields than a displacement"),
-        (problem.dynamics is not None, "inertia"),
-        (bool(problem.equations), "equations between nodes"),
-        (any(one.distribute for one in problem.couplings), "couplings that distribute forces"),
-        (bool(problem.points) and problem.config.degree > 1, "forces or springs at points, which are nodes of degree 2"),
-        (problem.bodies.dead is not None, "forces that a step has not released yet"),
+        (not problem.config.moves or (alone and problem.config.unknowns.mixed), "other fields than a displacement"),
+        (alone and problem.dynamics is not None, "inertia"),
+        (alone and bool(problem.equations), "equations between nodes"),
+        (alone and any(one.distribute for one in problem.couplings), "couplings that distribute forces"),
+        (
+            alone and bool(problem.points) and problem.config.degree > 1,
+            "forces or springs at points, which are nodes of degree 2",
+        ),
+        (alone and problem.bodies.dead is not None, "forces that a step has not released yet"),
     ):
         if present:
+            other = '; error_estimate(problem, by="recovery") needs the stress alone' if problem.config.moves else ""
             raise InputError(
-                f"the problem has {what}: an estimate of its error expects forms of a displacement alone, in statics"
+                f"the problem has {what}: an estimate of its error expects forms of a displacement alone, in statics{other}"
             )
     if not problem.progress.steps:
         raise InputError("the problem has no step yet: expected a solution, whose error is estimated")
@@ -134,6 +152,7 @@ class ErrorLimit:
 
     Args:
         bound: on the estimate over the displacement, in the energy norm; 0.05 is 5 %.
+        by: see ``error_estimate``.
 
     Attributes:
         found: estimated error of every step so far; NaN without displacement, and while a step releases forces.
@@ -151,18 +170,20 @@ class ErrorLimit:
     """
 
     bound: float
+    by: By = "residual"
     found: list[float] = field(default_factory=list, init=False)
     exceeded: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self.bound = given.number("bound", self.bound, given.between(0.0, 1.0))
+        given.word("by", self.by, WAYS)
 
     def __call__(self, problem: UnitedProblem) -> None:
         """Estimate the error of the committed step of a problem, and warn (collective)."""
         if problem.bodies.dead is not None:
             self.found.append(float("nan"))
             return
-        estimate = estimated(problem)
+        estimate = estimated(problem, self.by)
         self.found.append(estimate.relative)
         below, self.exceeded = not self.exceeded, estimate.at_most > self.bound
         if below and self.exceeded:
