@@ -61,17 +61,19 @@ def test_bodies_with_a_free_side(caplog):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("offset", [0.0, 0.01])
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron"])
-def test_bodies_that_change_their_volume(cell, degree, caplog):
-    """The force by displacements alone is exact to 2 %, and to a thousandth at degree 2; there is no warning."""
+def test_bodies_that_change_their_volume(cell, degree, offset, caplog):
+    """The force by displacements alone is exact to 2 %, and to a thousandth at degree 2, also of a fit that grows: no warning."""
     b = blocks(COMM, cell, 3, 4, degree=degree)
     sides = [(c, b.scene.tag("side", body, at(c, end))) for c in range(b.gdim - 1) for end in (0.0, 1.0) for body in (0, 1)]
     bcs = [uem.dirichlet(b.V, b.bottom, b.gdim - 1), *(uem.dirichlet(b.V, tag, c) for c, tag in sides)]
-    bcs = [*bcs, uem.dirichlet(b.V, b.top, b.gdim - 1, -0.01)]
+    bcs = [*bcs, uem.dirichlet(b.V, b.top, b.gdim - 1, offset - 0.01)]
     contact = uem.Contact(b.high, b.low)
+    problem = uem.UnitedProblem(linear(b.u, 1.0, 0.3), b.u, bcs=bcs, contacts=[contact])
     with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):
-        run(uem.UnitedProblem(linear(b.u, 1.0, 0.3), b.u, bcs=bcs, contacts=[contact]))
+        list(uem.load_steps(problem, [uem.Step(n=2, offset={contact: offset})]))
     exact = 0.7 / (1.3 * 0.4) * 0.005
     assert abs(contact.resultant().force[-1] / exact - 1.0) < (0.02 if degree == 1 else 1e-3)
     assert WORDS not in caplog.text

@@ -89,6 +89,44 @@ def test_a_joint_opens_at_its_contact_pressure(how):
     assert np.abs(opened.contact.resultant().force).max() < 1e-8 * opened.area
 
 
+@pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
+def test_supports_bear_the_fluid(coupling):
+    """Two blocks held apart, the lower one at all nodes: each support bears pressure times area, until the contact is switched off."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, k - 1.0], [1.0, float(k)], [3 + k, 2]) for k in range(2)])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    low, top = s.tag("low", 0, lambda x: x[:, 0] > -1.0), s.tag("top", 1, at(1, 1.0))
+    leak = uem.Leak(0.3, inlet=s.tag("inlet", 1, at(0, 0.0)))
+    seal = uem.Contact(s.tag("foot", 1, at(1, 0.0)), s.tag("base", 0, at(1, 0.0)), leak=leak, coupling=coupling)
+    bcs = [uem.dirichlet(V, low), uem.dirichlet(V, top, 0), uem.dirichlet(V, top, 1, 0.01)]
+    F = uem.LinearElastic(10.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[seal])
+    for step in uem.load_steps(problem, [uem.Step("on"), uem.Step("off", contacts={seal: False})]):
+        push = 0.3 if step.step == "on" else 0.0
+        below, above = problem.reaction(low), problem.reaction(top)
+        assert abs(below[1] - push) < 1e-10 and np.abs(below + above).max() < 1e-10
+
+
+def test_a_piston():
+    """The energies of a block that a fluid drives off are the pressure's work on its way."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 2.0], [2, 8])])
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    law, foot = uem.StVenantKirchhoff(1e4, 0.0, kind="plane_strain"), s.tag("foot", 0, at(1, 0.0))
+    plane = uem.RigidPlane(np.zeros(2), np.array([0.0, 1.0]))
+    seal = uem.Contact(foot, plane, leak=uem.Leak(2.0, inlet=s.tag("inlet", 0, at(0, 0.0))))
+    bcs = [uem.dirichlet(V, s.tag("side", 0, at(0, x)), 0) for x in (0.0, 1.0)]
+    problem = uem.UnitedProblem(
+        law.residual(u, v) * ufl.dx, u, bcs=bcs, contacts=[seal], dynamics=uem.Dynamics(uem.lumped_mass(V, 1.0))
+    )
+    book = uem.EnergyBook(problem, law.energy(u) * ufl.dx)
+    for step in uem.time_steps(problem, 0.05, 0.5):
+        row = book.write(step)
+    way = uem.integrate(u[1] * uem.ds(foot))
+    assert way > 0.1 and abs(row.external / (2.0 * way) - 1.0) < 5e-3
+    assert abs(row.defect) < 2e-3 * row.kinetic
+
+
 def test_it_closes_where_it_opened():
     """A pressure that falls below the contact pressure lets the joint close, and the fluid leaves it."""
     joint = Joint(lambda s: 1.5 * (1 - abs(2 * s - 1)))

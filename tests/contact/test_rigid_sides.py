@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from body_scenes import surface_of
 from dolfinx import fem
-from helpers import MESHES, at, box, clamp, highest, linear, run, scene
+from helpers import MESHES, at, box, clamp, highest, linear, refused, run, scene
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -137,6 +137,13 @@ def test_none_pulls_or_the_error_says_what_helps(held, coupling, across, half):
     assert least >= -1e-9 * most < 0.0
     if not held:
         assert contact.resultant().force[1] == pytest.approx(0.05, rel=1e-6)
+
+
+@NEARLY
+def test_a_contactor_that_is_left_inside():
+    """Equations that nearly depend on others leave a contactor inside its target: the error names it, and the sides to exchange."""
+    problem, _ = punch_on_block("quadrilateral", 2 / 3, rigid_first=True)
+    assert "finer surfaces" not in str(refused(uem.OverdeterminedError, ("inside the target", ADVICE), lambda: run(problem)))
 
 
 @NEARLY

@@ -35,7 +35,7 @@ class Energies:
         stored: in the bodies' strain.
         dissipated: by plastic flow.
         damped: by the damping form.
-        external: work of the external forces, of gravity and of the reactions of Dirichlet conditions.
+        external: work of the external forces, of gravity, of fluids in contacts and of the reactions of Dirichlet conditions.
         contact: work of the contact forces; zero except for friction, rounding, moving rigid targets, forces of preloads, the
             step of first contact, and soft contacts, which store it.
         friction: energy dissipated by friction, and by damping of soft contacts; with fixed targets and hard contact its sum with
@@ -65,7 +65,7 @@ class EnergyBook(Closing, given.Sealed):
         problem: with ``dynamics``.
         stored: strain energy of the bodies as a UFL form; the energy of materials with history is added.
         external: virtual work of the external forces as a UFL form, linear in a test function: the terms with a minus sign in F.
-            Loads and springs at nodes, and linear equations, are included by default.
+            Loads and springs at nodes, fluids in contacts, and linear equations, are included by default.
         path: name of the CSV file; None writes none.
         resume: keep the rows of an existing file up to the present time, and append to them.
 
@@ -148,9 +148,11 @@ class EnergyBook(Closing, given.Sealed):
             problem.bodies.assemble()
             known = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
+        leaking: list[Any] = [c.pair for c in self._contacts if c.leak is not None and c.on]
+        fluid = sum((pair.on_nodes().ravel() for pair in leaking), np.zeros(n))
         held = ~problem.bodies.free[: problem.config.n_owned].ravel()
-        reaction = (known[:n] - contact - linear) * held
-        outer = reaction + self.dynamics.weight().array_r + self._assembled(self._external)
+        reaction = (known[:n] - contact - linear - fluid) * held
+        outer = reaction + fluid + self.dynamics.weight().array_r + self._assembled(self._external)
         if problem.bodies.tangent.points is not None:
             outer += problem.bodies.tangent.points.loads().ravel()
         if added := self.dynamics.added:

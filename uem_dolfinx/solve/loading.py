@@ -402,6 +402,8 @@ def reactions(problem: Any) -> Array:
     at = owned_displacement(problem)
     for contact in problem.contacts:
         forces[at] -= contact.force.x.array.reshape(-1, config.gdim)[: config.n_owned]
+        if contact.leak is not None and contact.on:
+            forces[at] -= contact.pair.on_nodes()
         for heat in contact.pair.heats if contact.on else ():
             forces[: len(own)] += config.from_rows(heat.residual())
     if problem.linear is not None:

@@ -61,6 +61,9 @@ class LeakingInterface(Interface):
         self._changes: Ints = np.zeros(len(self.nodes), np.int64)
         #: Rows of gaps at the beginning of the step, and areas over the forces of multipliers ``(n,)``; None before the first residual.
         self._begun: tuple[GapRows, Array] | None = None
+        #: Global nodes and forces of the fluid as last applied, and in the committed state; None before the first residual.
+        self._acting: tuple[Ints, Array] | None = None
+        self._committed_acting: tuple[Ints, Array] | None = None
         self.trial = self.committed = replace(self.committed, wet=self._inlet)
 
     def _everywhere(self, contactors: Bools) -> Bools:
@@ -94,19 +97,34 @@ class LeakingInterface(Interface):
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """The fluid's forces by the rows of gaps, as loads of both bodies (collective)."""
-        own, wet = super().applied_forces(), self._inlet if self.trial.wet is None else self.trial.wet
         if not self.asked:
-            return own
+            return None
+        # a contact that was switched off knows of no fluid
+        wet = self._inlet if self.trial.wet is None else self.trial.wet
         p = self._law.at(self.config.comm, self.name, float(self._contact._at))
         if self._begun is None:
             self._begun = self.kinematics.gap_rows, self._contact.measured_areas() / self.kinematics.pressure_map(False).force
         rows, area = self._begun
         multipliers = np.zeros(len(rows.equations))
         multipliers[: len(area)] = np.where(wet & ~self.off, p * area, 0.0)
-        nodes, forces = rows.forces(multipliers)
-        return (nodes, forces) if own is None else (np.concatenate([own[0], nodes]), np.concatenate([own[1], forces]))
+        self._acting = rows.forces(multipliers)
+        return self._acting
+
+    def on_nodes(self) -> Array:
+        """The fluid's forces in the last equilibrium, on the owned nodes of both bodies ``(n_owned, gdim)`` (collective)."""
+        if self._acting is None and self.applied_forces() is not None:
+            # the next step has rows of its own
+            self._begun = None
+        none: Array = np.zeros((self.config.n_owned, self.config.gdim))
+        return none if self._acting is None or not self.asked else self.config.add_at_owners(*self._acting)
+
+    def commit(self) -> None:
+        """See ``Interface``."""
+        self._committed_acting = self._acting
+        super().commit()
 
     def restore(self) -> None:
         """See ``Interface``."""
         super().restore()
+        self._acting = self._committed_acting
         self._changes, self._begun = np.zeros(len(self.nodes), np.int64), None

@@ -1,8 +1,8 @@
 """Warnings of confined bodies that give way into the room between surfaces which nodes alone hold.
 
 Supports that move by u take the volume ``-int u . n`` over their surfaces from bodies that are confined on all sides. Where gaps are
-closed, the bodies lose as much, ``-int tr grad u``, less the volume of initial gaps. On meshes that do not match, contact by nodes leaves
-room between the nodes: bodies that hardly change their volume give way into it, and resist by less.
+closed, the bodies lose as much, ``-int tr grad u``, less the volume of initial gaps, of which offsets take a part. On meshes that do
+not match, contact by nodes leaves room between the nodes: bodies that hardly change their volume give way into it, and resist by less.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import ufl
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Bools
+from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.facets import facets_of
 from uem_dolfinx.geometry.surfaces import exterior_facets, surface_nodes, tributary_areas
@@ -50,15 +50,16 @@ class Confined:
         self._sides = np.concatenate(
             [side.entities for c in contacts for side in (c.contactor, c.target) if isinstance(side, Tag)]
         )
-        #: Gaps of each contact's contactors at the start ``(n,)``.
-        self._gaps = [np.array(c.pair.kinematics.projection.gap) for c in contacts]
+        #: Heights of each contact's contactors at the start, gaps without offsets ``(n,)``.
+        self._heights = [np.array(c.pair.kinematics.heights()) for c in contacts]
         #: Components without Dirichlet condition for which ``_confined`` is known.
         self._free: Any = None
         self._confined = self._warned = False
 
-    def _area(self, side: Any, nodes: Any, values: Any = 1.0) -> float:
-        """Integral over a surface of values at its owned ``nodes (n,)`` (collective)."""
-        return float(reduced(self._config.comm, float((tributary_areas(self._config, side)[nodes] * values).sum())))
+    def _area(self, side: Any) -> float:
+        """Area of a surface (collective)."""
+        nodes = surface_nodes(self._config, side)
+        return float(reduced(self._config.comm, float(tributary_areas(self._config, side)[nodes].sum())))
 
     def look(self) -> None:
         """Warn, once, if bodies give way into the room between surfaces (collective)."""
@@ -70,7 +71,13 @@ class Confined:
         closed = all(c.on and bool(c.pair.united.all()) for c in self._contacts)
         if not reduced(self._config.comm, closed, op=MPI.LAND):
             return
-        gaps, of_volumes = self._volumes
+        areas, of_volumes = self._volumes
+        offsets = (c.pair.discretisation.setting.offset for c in self._contacts)
+        gaps = sum(
+            float((area * (height - (0.0 if offset is None else offset))).sum())
+            for area, height, offset in zip(areas, self._heights, offsets)
+        )
+        gaps = float(reduced(self._config.comm, gaps))
         taken, *lost, size = (forms.assemble_scalar(form, self._config.comm) for form in of_volumes)
         # small strains neglect products of gradients, finite strains do not
         room, size = min(abs(taken - gaps - one) for one in lost), max(abs(taken - gaps), size)
@@ -105,16 +112,16 @@ class Confined:
         """Whether both sides of a contact have the same area (collective)."""
         if not isinstance(contact.target, Tag):
             return True
-        own, theirs = (self._area(side, surface_nodes(self._config, side)) for side in (contact.contactor, contact.target))
+        own, theirs = self._area(contact.contactor), self._area(contact.target)
         return abs(own - theirs) <= COVERED * theirs
 
     @cached_property
-    def _volumes(self) -> tuple[float, list[Any]]:
-        """Volume of the gaps at the start, and four forms (first time: collective).
+    def _volumes(self) -> tuple[list[Array], list[Any]]:
+        """Areas of each contact's contactors ``(n,)``, and four forms (first time: collective).
 
         Of the volume that supports take, of that which bodies lose in small and in finite strains, and of its size everywhere.
         """
-        gaps = sum(self._area(c.contactor, c.pair.nodes, gap) for c, gap in zip(self._contacts, self._gaps))
+        areas = [tributary_areas(self._config, c.contactor)[c.pair.nodes] for c in self._contacts]
         mesh, u = self._config.mesh, self._config.u
         G = displacement_gradient(u)
         held = np.setdiff1d(self._outside.entities, self._sides)
@@ -122,4 +129,4 @@ class Confined:
         dx = ufl.dx(domain=mesh)
         lost = -ufl.tr(G) * dx, (1.0 - ufl.det(ufl.Identity(G.ufl_shape[0]) + G)) * dx, abs(ufl.tr(G)) * dx
         with compiling("volumes of confined bodies"):
-            return gaps, [forms.form(revolved(form)) for form in (taken, *lost)]
+            return areas, [forms.form(revolved(form)) for form in (taken, *lost)]

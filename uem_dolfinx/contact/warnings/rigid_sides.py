@@ -18,7 +18,7 @@ from uem_dolfinx.conditions.seams import seams_of
 from uem_dolfinx.contact.both_sides import OfBothSides
 from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.pair.interface import Interface
-from uem_dolfinx.errors import ConvergenceError, UEMError
+from uem_dolfinx.errors import ConvergenceError, OverdeterminedError, UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import facets_of
 from uem_dolfinx.geometry.surfaces import surface_nodes
@@ -70,8 +70,8 @@ class RigidSides:
         return bool(some) and not free
 
     def advise(self, error: UEMError) -> None:
-        """Add advice to a ConvergenceError if equations of rigid contactors depend on others in the present state (collective)."""
-        if not isinstance(error, ConvergenceError):
+        """Add advice to an error of an active set if equations of rigid contactors depend on others in the present state (collective)."""
+        if not isinstance(error, ConvergenceError | OverdeterminedError):
             return
         for contact in self._contacts:
             pair = contact.pair

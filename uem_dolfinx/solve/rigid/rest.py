@@ -20,7 +20,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx.arrays import AnyArray, Array
 from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
-from uem_dolfinx.errors import ConvergenceError, FloatingBodyError, UEMError
+from uem_dolfinx.errors import ConvergenceError, FloatingBodyError, OverdeterminedError, UEMError
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
@@ -81,9 +81,10 @@ def converge_or_rest(problem: Any, start: Array, fraction: float, along: Any, sy
     converge = partial(problem.converge, problem.bodies, system, start, fraction, along)
     try:
         history: list[Any] = converge()
-    except (ConvergenceError, FloatingBodyError) as error:
+    except (ConvergenceError, FloatingBodyError, OverdeterminedError) as error:
         problem.watch.advise(error)
-        rested = _rest(problem, converge) if along is None and _may_rest(problem) else None
+        may_rest = along is None and not isinstance(error, OverdeterminedError) and _may_rest(problem)
+        rested = _rest(problem, converge) if may_rest else None
         if rested is None:
             raise error
         history = rested
