@@ -43,6 +43,7 @@ class Scheme:
     gamma: float
     alpha_m: float = 0.0
     alpha_f: float = 0.0
+    explicit: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for name in ("beta", "gamma", "alpha_m", "alpha_f"):
@@ -142,6 +143,7 @@ class CentralDifferences:
     #: Weights of the beginning of a step in the equation of motion.
     alpha_m: ClassVar[float] = 0.0
     alpha_f: ClassVar[float] = 0.0
+    explicit: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         given.number("safety", self.safety, given.between(0.0, 1.0))
@@ -157,4 +159,4 @@ class CentralDifferences:
 
 def is_explicit(dynamics: Any) -> bool:
     """Whether these dynamics, or None, take explicit steps."""
-    return dynamics is not None and isinstance(dynamics.scheme, CentralDifferences)
+    return dynamics is not None and bool(dynamics.scheme.explicit)

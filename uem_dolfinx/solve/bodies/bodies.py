@@ -19,7 +19,6 @@ from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.options import check_fields
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, largest_of_groups
-from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InputError, NotFiniteError
 from uem_dolfinx.geometry.bodies import find_bodies, linked_bodies
 from uem_dolfinx.geometry.configuration import Configuration
@@ -388,7 +387,7 @@ class Bodies:
         for material in self.materials:
             material.commit()
         self.stiffness_at_start = self.stiffness
-        explicit = self.dynamics is not None and self.dynamics.moving and is_explicit(self.dynamics)
+        explicit = self.dynamics is not None and self.dynamics.moving and self.dynamics.scheme.explicit
         self.driving = np.array(self.residual.array_r) if explicit else None
 
     def restore(self) -> None:

@@ -22,7 +22,6 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InvertedElementError, NotFiniteError, SpaceError, UEMError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
 from uem_dolfinx.geometry.configuration import Configuration
@@ -296,7 +295,7 @@ class Inversions:
 
     def marked(self, F: ufl.Form, dynamics: Dynamics | None) -> ufl.Form:
         """The residual that steps of ``dynamics`` assemble, F: in explicit steps NaN where points of its cells are turned inside out."""
-        if not is_explicit(dynamics):
+        if dynamics is None or not dynamics.scheme.explicit:
             return F
         nothing = (
             ufl.conditional(ufl.gt(self._J, 0.0), 0.0, fem.Constant(self.config.mesh, np.nan)) * ufl.grad(F.arguments()[0])[0, 0]
