@@ -31,6 +31,10 @@ def test_tangents_in_free_components():
     T = stick_slip.tangents(normal[:, None], free)
     assert np.abs(np.einsum("nrg,ng->nr", T, normal)).max() <= 1e-15
     assert np.abs(np.einsum("nrg,nsg->nrs", T, T) - np.eye(2)).max() <= 1e-14
+    # rounding does not turn those of flat surfaces
+    normal[:] = np.eye(3)[2] + 1e-9 * normal
+    T = stick_slip.tangents(normal[:, None], free)
+    assert np.ptp(T, axis=0).max() <= 1e-8
     free[:, 1] = False
     T = stick_slip.tangents(normal[:, None], free)
     assert (T.any(axis=2).sum(axis=1) == 1).all() and not T[:, :, 1].any()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from friction_scenes import driven
-from helpers import clamp, modulus, st_venant
+from helpers import clamp, linear, modulus, st_venant
 
 import uem_dolfinx as uem
 
@@ -27,12 +27,12 @@ def general(**how):
     return make
 
 
-def hand(mu=0.3, cell="quadrilateral", rigid=False, degree=1, **how):
+def hand(mu=0.3, cell="quadrilateral", rigid=False, degree=1, law=st_venant, **how):
     """The driven block, with one contact."""
 
     def make():
         n = (3, 5) if cell in ("triangle", "quadrilateral") else (2, 3)
-        scene = driven(cell, mu, law=st_venant, n=n, rigid=rigid, degree=degree, how=how)
+        scene = driven(cell, mu, law=law, n=n, rigid=rigid, degree=degree, how=how)
         return scene.problem, scene.top
 
     return make
@@ -52,9 +52,13 @@ SCENES = {
     "wear": hand(wear=0.02),
     "offset": hand(offset=0.004),
     "tetrahedra": hand(cell="tetrahedron"),
+    "linear bodies": hand(law=linear),
+    "linear bodies in space": hand(law=linear, cell="hexahedron"),
+    "linear bodies, mortar": hand(law=linear, **MORTAR),
+    "linear bodies, rigid target": hand(law=linear, rigid=True),
     "general": general(friction=0.2),
     "general, mortar": general(friction=0.2, **MORTAR),
     "general, itself": general(self_contact=True),
 }
 #: Those that are always tested.
-QUICK = {"friction", "mortar with friction", "wear", "general"}
+QUICK = {"friction", "linear bodies", "linear bodies in space", "mortar with friction", "wear", "general"}

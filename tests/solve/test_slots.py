@@ -127,6 +127,9 @@ def test_random_problems(kind, d, mu):
         assert error(p, s) <= 1e-9
         assert not (p.gap + s.w[p.normal])[s.active].any()
         assert not (p.slip + tangential(p, s.w))[s.stick].any()
+        # from what has been found another solve finds no more
+        again = coulomb.solve(p, s.w)
+        assert again.solves <= 2 and error(p, again) <= 1e-9
 
 
 @pytest.mark.slow

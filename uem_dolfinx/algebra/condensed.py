@@ -43,10 +43,11 @@ class Solved:
         du: increment of the bodies.
         negative: whether the constrained matrix has a negative determinant.
         indefinite: whether it is symmetric, and has negative eigenvalues.
+        left: part of the right-hand side that it leaves; 0 for rounding.
     """
 
-    def __init__(self, du: PETSc.Vec, negative: bool, indefinite: bool):
-        self.du, self.negative, self.indefinite = du, negative, indefinite
+    def __init__(self, du: PETSc.Vec, negative: bool, indefinite: bool, left: float = 0.0):
+        self.du, self.negative, self.indefinite, self.left = du, negative, indefinite, left
 
 
 class Condensed(Returning):
@@ -91,8 +92,8 @@ class Condensed(Returning):
         #: Its unknowns, if they are known without it.
         self._taken: PETSc.Vec | None = None
         self._dense: _Dense | None = None
-        #: Whether the constrained matrix has a negative determinant, and, if it is symmetric, negative eigenvalues.
-        self.negative = self.indefinite = False
+        #: Whether the constrained matrix has a negative determinant, and, if it is symmetric, negative eigenvalues; see ``Solved``.
+        self.negative, self.indefinite, self.left = False, False, 0.0
         self.begin_at(None)
         #: An increment du under the forces on I of the last solve, with K du, and whether the unknowns of I have been computed, too.
         self._known: tuple[PETSc.Vec, PETSc.Vec] | None = None
@@ -213,7 +214,8 @@ class Condensed(Returning):
             test = trial if P is Q else self._on_root(test_rows, numbers)
             curvature = None if G is None else self._on_root(blocks_of_matrix(self.space, G), numbers)
             used = on_root(self.space.comm, P.used.ravel()[self._at].astype(float)) > 0
-            self.made_of, self._dense, self._taken, self.negative = (P, Q, self._made_for[0], G), None, None, False
+            self.made_of, self._dense, self._taken = (P, Q, self._made_for[0], G), None, None
+            self.negative, self.left = False, 0.0
             if self.space.comm.rank == 0:
                 self._dense = _Dense(self._St, curvature, trial[:, used], None if P is Q else test[:, used], used)
             negative, indefinite = self.space.comm.bcast(self._dense and (self._dense.negative, self._dense.indefinite))
@@ -222,7 +224,7 @@ class Condensed(Returning):
     def take(self, solved: Solved, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
         """Use a known solution of the constrained problem (collective)."""
         self.made_of, self._dense, self._taken = (P, Q, K, G), None, P.reduce(solved.du - P.c)
-        self.negative, self.indefinite, self.whole = solved.negative, solved.indefinite, True
+        self.negative, self.indefinite, self.left, self.whole = solved.negative, solved.indefinite, solved.left, True
 
     def begin_at(self, c: PETSc.Vec | None, rounding: float = 0.0) -> None:
         """Set the increment c to which the next solves add ``P dq``; None is zero, and they then complete the unknowns of I at once."""

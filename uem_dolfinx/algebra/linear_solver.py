@@ -16,6 +16,7 @@ from uem_dolfinx.algebra.kept_factor import KeptFactor
 from uem_dolfinx.algebra.ksp import KspOfOptions
 from uem_dolfinx.algebra.options import NO_SUCH_TYPE, check_options, last_words, options_in_turn, tell_unused
 from uem_dolfinx.algebra.products import UnitedMatrix, made_of
+from uem_dolfinx.algebra.relative import KeptCondensation
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.geometry.nodes import Nodes
@@ -33,7 +34,7 @@ class UnitedSolver(KspOfOptions):
     PETSc's ``options`` are given without ``prefix``; defaults depend on the size. Without ``ksp_rtol`` the tolerance follows Newton.
     """
 
-    parts = "_kept", "_preconditioner", "condensed"
+    parts = "_kept", "_preconditioner", "condensed", "slots"
 
     def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
         self.space = space
@@ -58,6 +59,8 @@ class UnitedSolver(KspOfOptions):
         self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
         #: K condensed onto the contact, and whether the present constrained matrix uses it.
         self.condensed, self._on_condensed = Condensed(space), False
+        #: K condensed onto slots of contactors.
+        self.slots = KeptCondensation()
         #: Whether K is the same for every displacement, and K of the last constrained matrix with the state of its values.
         self.lasting = False
         self._of: tuple[PETSc.Mat, int] | None = None
@@ -74,8 +77,8 @@ class UnitedSolver(KspOfOptions):
     def forget(self) -> None:
         """Drop the constrained matrix, factorisations and the set-up of the preconditioner (collective)."""
         self._served = self._factor_of = self._of = self._made_of = self._arguments = None
-        self._kept.drop()
-        self.condensed.drop()
+        for made in (self._kept, self.condensed, self.slots):
+            made.drop()
         self._make_anew(self._first)
 
     def _make_anew(self, options: dict[str, Any]) -> None:
@@ -109,6 +112,11 @@ class UnitedSolver(KspOfOptions):
     def cheap(self) -> bool:
         """Whether solves for another active set need no factorisation, and few solves by an earlier one."""
         return self.iterative or self._on_condensed or (self._served is not None and self._kept.cheap)
+
+    @property
+    def gives_way(self) -> bool:
+        """Whether CG leaves unsymmetric matrices to a factorisation, which serves for all of them if K is constant."""
+        return self.iterative and self.lasting and bool(self._instead)
 
     def set_operator(
         self, restriction: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, test: Restriction | None = None, roughly: bool = False
@@ -296,6 +304,10 @@ class UnitedSolver(KspOfOptions):
     def exact(self) -> bool:
         """Whether solves with the present matrix are exact up to rounding."""
         return not self.iterative and self._served is None
+
+    def left(self, accuracy: float) -> float:
+        """Part of its right-hand side that the last solve, of this ``accuracy``, may have left; 0 for rounding."""
+        return self.condensed.left if self._on_condensed else 0.0 if self.exact else accuracy
 
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and the number of linear iterations (collective).

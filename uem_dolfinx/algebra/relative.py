@@ -8,7 +8,8 @@ columns of T. With ``K_U = T'(K + G)T`` condensed onto the slots,
     force = S w + f
 
 are the multipliers of all equations, whichever contactors are open, stick or slip. Motions w give those of the bodies without another
-factorisation.
+factorisation. Where the bodies are linear, T changes little while contactors slide: the factorisation and S then serve other T, with
+the forces that T itself leaves, in a few passes.
 """
 
 from __future__ import annotations
@@ -21,12 +22,17 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra import mumps
 from uem_dolfinx.algebra.blocks import is_symmetric, stiffen
+from uem_dolfinx.algebra.kept_factor import Returning
 from uem_dolfinx.algebra.products import UnitedMatrix
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
-from uem_dolfinx.parallel import on_root
+from uem_dolfinx.parallel import on_root, reduced
+
+#: Solutions leave this part of the forces: what is below comes near to rounding.
+#: [convention; norm of the forces; test_settle.py::test_a_condensation_serves_other_coordinates]
+BALANCED = 1e-10
 
 
 class RelativeCoordinates:
@@ -69,59 +75,101 @@ class Condensation:
         stiffness: S on rank 0, in the order of the ranks' slots, else empty; None if MUMPS fails.
         negative: whether the matrix without the slots has a negative determinant.
         indefinite: whether it is symmetric, and has negative eigenvalues.
+        nodes: mask of owned nodes with slots ``(n_owned,)``.
+        moved_on: whether the present coordinates are others than those of the factorisation.
     """
 
     def __init__(self, space: Nodes, trial: RelativeCoordinates, test: RelativeCoordinates, K: PETSc.Mat, G: PETSc.Mat | None):
         self.space, self.trial, self.test, self._K, self._G = space, trial, test, K, G
-        self._at: Ints = np.sort(trial.slot[trial.slot >= 0])
-        self.A = UnitedMatrix(space, False).update(trial.T, test.T, K, G)
-        symmetric = is_symmetric(self.A, space)
-        self.A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        self._at, self.moved_on, self.left = _slots(trial), False, 0.0
+        self.nodes: Bools = np.zeros(space.n_owned, dtype=bool)
+        self.nodes[self._at // space.block] = True
+        A = UnitedMatrix(space, False).update(trial.T, test.T, K, G)
+        symmetric = is_symmetric(A, space)
+        A.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self._pc = PETSc.PC().create(space.comm)
         self._pc.setType("cholesky" if symmetric else "lu")
-        self._pc.setOperators(self.A)
+        self._pc.setOperators(A)
         self.stiffness: Any
         with timed("factorisation or preconditioner set-up"):
             self.stiffness = mumps.schur_complement(self._pc, self._at + space.block * space.first)
             self.negative, self.indefinite = mumps.is_negative(self._pc), mumps.is_indefinite(self._pc)
             if self.stiffness is not None and not mumps.solves_with_schur_complement(space.comm):
-                self.stiffness = self.stiffness if self._factorise_inside() else None
+                self.stiffness = self.stiffness if self._factorise_inside(A) else None
 
-    def _factorise_inside(self) -> bool:
+    def _factorise_inside(self, A: PETSc.Mat) -> bool:
         """Factorise without the slots, since the factorisation with a Schur complement cannot solve; whether it succeeds (collective)."""
-        inside, used = self.A.copy(), self.trial.T.used.ravel().copy()
-        used[self._at] = False
-        inner = self.space.vector(used)
+        inside, inner = A.copy(), self.space.vector(~self._held)
         inside.diagonalScale(inner, inner)
-        stiffen(inside, self._K, ~used)
+        stiffen(inside, self._K, self._held)
         self._pc.reset()
         self._pc.setOperators(inside)
         self._pc.setUp()
         return bool(self._pc.getFailedReason() == PETSc.PC.FailedReason.NOERROR)
 
-    def load(self, F: PETSc.Vec) -> Any:
-        """Forces in the slots without relative motion under forces F of the bodies, on rank 0; an empty array elsewhere (collective)."""
-        self._y = self.test.T.transpose(F + forms.product(self._K, self.trial.T.c, self._G))
-        left = self._y + self.A * self._moved(self._y)
-        return on_root(self.space.comm, left.array_r[self._at])
+    def serves(self, trial: RelativeCoordinates) -> bool:
+        """Whether other coordinates have the same slots (collective)."""
+        same = np.array_equal(_slots(trial), self._at) and np.array_equal(trial.T.used, self.trial.T.used)
+        return not reduced(self.space.comm, int(not same))
 
-    def _moved(self, y: PETSc.Vec) -> PETSc.Vec:
-        """Unknowns in equilibrium with forces ``y`` on them, zero in slots (collective)."""
-        inside, moved = -y, y.duplicate()
-        inside.array[self._at] = 0.0
-        inside.array[~self.trial.T.used.ravel()] = 0.0
-        self._pc.apply(inside, moved)
+    def use(self, trial: RelativeCoordinates, test: RelativeCoordinates, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
+        """Solve in other coordinates with the same slots; arguments as of the class."""
+        self.trial, self.test, self._K, self._G, self.moved_on = trial, test, K, G, True
+
+    def begin(self, F: PETSc.Vec) -> None:
+        """Begin without relative motion, under forces F of the bodies (collective)."""
+        self._left = self.test.T.transpose(F + forms.product(self._K, self.trial.T.c, self._G))
+        self._y = self._left.duplicate()
+        self._y.set(0.0)
+        self._driving = self._inside().norm()
+
+    def forces(self) -> Any:
+        """Forces in the slots once the bodies have followed their motions, on rank 0; an empty array elsewhere (collective)."""
+        moved = self._left.duplicate()
+        self._pc.apply(-self._inside(), moved)
         moved.array[self._at] = 0.0
-        return moved
+        self._move(moved)
+        return on_root(self.space.comm, self._left.array_r[self._at])
 
-    def moved(self, w: Any) -> PETSc.Vec:
-        """Increment du with relative motions w, on rank 0 ``(k,)``, under the forces of the last ``load`` (collective)."""
+    def balanced(self, force: Any, left: float) -> bool:
+        """Whether ``force``, on rank 0, and the forces in the slots agree, and no others are left (collective).
+
+        ``left`` is the part of the first forces outside the slots that may be left; the attribute is the part that is.
+        """
+        there = on_root(self.space.comm, self._left.array_r[self._at])
+        apart = np.linalg.norm(there - force) if self.space.comm.rank == 0 else 0.0
+        apart = self._inside().norm() + self.space.comm.bcast(apart)
+        self.left = apart / self._driving if self._driving > 0 else 0.0
+        return bool(apart <= max(BALANCED * self._left.norm(), left * self._driving))
+
+    def _inside(self) -> PETSc.Vec:
+        """Forces outside the slots."""
+        inside = self._left.copy()
+        inside.array[self._held] = 0.0
+        return inside
+
+    def move(self, way: Any) -> None:
+        """Move the contactors further by relative motions, on rank 0 ``(k,)`` (collective)."""
         comm, slots = self.space.comm, self._y.duplicate()
         counts = np.cumsum(comm.allgather(len(self._at)))
-        slots.array[:] = 0.0
-        slots.array[self._at] = comm.scatter(np.split(w, counts[:-1]) if comm.rank == 0 else None)
-        du = self.trial.T.expand(slots + self._moved(self._y + self.A * slots))
-        return du + self.trial.T.c
+        slots.set(0.0)
+        slots.array[self._at] = comm.scatter(np.split(way, counts[:-1]) if comm.rank == 0 else None)
+        self._move(slots)
+
+    def _move(self, y: PETSc.Vec) -> None:
+        self._y += y
+        self._left += self.test.T.transpose(forms.product(self._K, self.trial.T.expand(y), self._G))
+
+    @property
+    def _held(self) -> Bools:
+        """Mask of slots and unused unknowns."""
+        held = ~self.trial.T.used.ravel()
+        held[self._at] = True
+        return held
+
+    def moved(self) -> PETSc.Vec:
+        """The increment du (collective)."""
+        return self.trial.T.expand(self._y) + self.trial.T.c
 
     def numbers(self, which: Ints) -> Ints:
         """Positions in S of the slots of some equations ``(...)``, -1 for -1 (collective)."""
@@ -132,3 +180,30 @@ class Condensation:
     def destroy(self) -> None:
         """Free the factors (collective)."""
         self._pc.destroy()
+
+
+class KeptCondensation(Returning):
+    """The last condensation, which bodies whose K is constant use for other coordinates."""
+
+    made = "now"
+
+    def __init__(self) -> None:
+        self.now: Condensation | None = None
+
+    def drop(self) -> None:
+        """Forget it (collective)."""
+        self.lose()
+        self.now = None
+
+    def make(self, *of: Any) -> Condensation | None:
+        """A new one, see ``Condensation``; None if MUMPS fails (collective)."""
+        self.drop()
+        self.now = Condensation(*of)
+        if reduced(self.now.space.comm, int(self.now.stiffness is None)):
+            self.drop()
+        return self.now
+
+
+def _slots(coordinates: RelativeCoordinates) -> Ints:
+    """Local components that are slots, sorted."""
+    return np.sort(coordinates.slot[coordinates.slot >= 0])

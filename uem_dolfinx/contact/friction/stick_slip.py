@@ -171,7 +171,7 @@ def tangents(normals: Array, free: Bools) -> Array:
         found = np.stack([-first[:, 1], first[:, 0]], axis=1)[:, None]
     else:
         # the first is perpendicular to the axis with the largest angle to the normal
-        across = cross_products(first, np.eye(3)[np.abs(first).argmin(axis=1)])
+        across = cross_products(first, np.eye(3)[np.abs(first).round(1).argmin(axis=1)])
         found = np.stack([across, cross_products(first, across)], axis=1)
     size = np.linalg.norm(found, axis=2, keepdims=True)
     found /= np.where(size > 0, size, 1.0)

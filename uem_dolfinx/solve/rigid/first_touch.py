@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
@@ -18,6 +19,9 @@ from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.rigid.rigid_motions import OPEN, RigidMotions
+
+if TYPE_CHECKING:
+    from uem_dolfinx.algebra.linear_solver import UnitedSolver
 
 
 def touch_ahead(
@@ -91,3 +95,16 @@ def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[
         return followed_nodes(config, found)[: config.n_owned]
 
     return beside if facets else None
+
+
+def way_ahead(bodies: Bodies, solver: UnitedSolver, pairs: Sequence[Interface], first: bool) -> Array | None:
+    """Way of the owned nodes by which contactors may come together ``(n_owned, gdim)``; None to solve the present state alone.
+
+    Problems with friction are solved on arrays from the beginning where a condensation is kept, in contact as it is or with the velocity of
+    the last step's end, and the ``first`` one of a time step where other states would be factorised anew.
+    """
+    dynamics, way = bodies.dynamics, np.zeros((bodies.forces.size // bodies.config.gdim, bodies.config.gdim))
+    ahead = first and dynamics is not None and not (solver.lasting or solver.iterative)
+    if not (ahead or solver.slots.now is not None) or not any(pair.friction is not None for pair in pairs):
+        return None
+    return way if dynamics is None else way + dynamics.dt * dynamics.velocity.x.array[: way.size].reshape(way.shape)

@@ -108,7 +108,8 @@ class _Newton:
         self.problem, self.solves = problem, 0
         self.there = problem.tangents >= 0
         self.frictional = (problem.slope > 0) | (problem.rest > 0)
-        self.diagonal = np.abs(np.diagonal(problem.stiffness))
+        self.size = np.abs(problem.stiffness)
+        self.diagonal = np.diagonal(self.size)
         own = np.where(self.there, self.diagonal[problem.tangents], 0.0).sum(axis=1)
         self.c_n, self.c = self.diagonal[problem.normal], SOFTER * own / np.maximum(self.there.sum(axis=1), 1)
 
@@ -132,9 +133,12 @@ class _Newton:
         from scipy.linalg.lapack import dgesv
 
         p, S, (w, free), negative = self.problem, self.problem.stiffness, self.held(now), False
+        i, asked = np.flatnonzero(now.closed & self.frictional & ~now.stick), free.copy()
+        asked[p.normal[i]] = True
         # forces by free slots, and in the last column by held ones
-        rows, place = np.column_stack([S[:, free], p.load + S[:, ~free] @ w[~free]]), np.cumsum(free) - 1
-        if len(i := np.flatnonzero(now.closed & self.frictional & ~now.stick)):
+        rows, place = np.zeros((len(S), free.sum() + 1)), np.cumsum(free) - 1
+        rows[asked, :-1], rows[:, -1] = S[np.ix_(asked, free)], p.load + S @ w
+        if len(i):
             # tau - part (y across along) - limit along, with y = tau - c v
             e, slots, there, c = now.along[i], p.tangents[i], self.there[i], self.c[i]
             turn = now.part[i, None, None] * (np.eye(e.shape[1]) - e[:, :, None] * e[:, None, :])
@@ -173,7 +177,7 @@ class _Newton:
     def rounding(self, now: _Point) -> float:
         """Violations that count as zero, a force; negative if forces are not known."""
         size = np.abs(self.problem.load)
-        rounding = HOLDS * float((np.abs(self.problem.stiffness) @ np.abs(now.w) + size).max(initial=0.0))
+        rounding = HOLDS * float((self.size @ np.abs(now.w) + size).max(initial=0.0))
         return rounding if rounding <= KNOWN * np.maximum(size, np.abs(now.force)).max(initial=0.0) else -1.0
 
     def run(self, w: Array) -> _Point | None:
@@ -211,9 +215,9 @@ class _Newton:
             closed = closed ^ (wrong & (np.cumsum(wrong) == 1) if alone else wrong)
         return None
 
-    def starts(self) -> Iterator[Array]:
-        """No motion, then motions with dampers in all slots: implicit steps in time, longer as long as they succeed."""
-        p, w, damping = self.problem, np.zeros_like(self.problem.load), 1.0
+    def starts(self, w: Array) -> Iterator[Array]:
+        """Motions w, then motions with dampers in all slots: implicit steps in time, longer as long as they succeed."""
+        p, damping = self.problem, 1.0
         yield w
         while damping > KNOWN and self.solves < MOST_SLOT_SOLVES:
             d = damping * self.diagonal
@@ -225,11 +229,11 @@ class _Newton:
                 yield (w := found.w)
 
 
-def solve(problem: SlotProblem) -> SlotState | None:
-    """A state in which the conditions of contact and friction hold, or None if none has been found."""
-    newton = _Newton(problem)
+def solve(problem: SlotProblem, near: Array | None = None) -> SlotState | None:
+    """A state in which the conditions of contact and friction hold, or None if none is found; ``near (k,)`` are motions to start from."""
+    newton, near = _Newton(problem), np.zeros_like(problem.load) if near is None else near
     found = None if newton.frictional.any() else newton.pivot()
-    if (found := found or next(filter(None, map(newton.run, newton.starts())), None)) is None:
+    if (found := found or next(filter(None, map(newton.run, newton.starts(near))), None)) is None:
         return None
     slips = found.closed & ~found.stick & newton.frictional
     direction = np.where(slips[:, None], -found.along, 0.0)

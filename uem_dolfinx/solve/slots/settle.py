@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -33,9 +33,15 @@ from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.bodies.tangent import known_forces
 from uem_dolfinx.solve.slots import coulomb
 
+if TYPE_CHECKING:
+    from uem_dolfinx.algebra.linear_solver import UnitedSolver
+
 #: A dense problem of so many slots takes 200 MB; beyond, one active set after the other is solved.
 #: [bound; slots; -]
 MOST_SLOTS = 5_000
+#: A condensation that does not serve other coordinates within so many passes is made anew.
+#: [bound; passes; -]
+MOST_PASSES = 6
 
 
 @dataclass(frozen=True)
@@ -117,32 +123,38 @@ class _Slots:
 
 def settle(
     bodies: Bodies,
+    solver: UnitedSolver,
     equations: Mapping[Interface, ContactRows],
     whole: ContactRows,
     test: Restriction,
     F: PETSc.Vec,
     G: PETSc.Mat | None,
     du: Array,
+    left: float,
 ) -> Solved | None:
     """Solve a linearised problem with all conditions of contact; the pairs then have its state (collective).
 
     Args:
         bodies: with their tangent.
+        solver: keeps the condensation where the tangent is constant.
         equations: rows of every pair that may be in contact.
         whole: all rows.
         test: Q of the present state.
         F: forces of the bodies at the present displacement, minus friction that is independent of normal forces.
         G: curvature of the contact, or None.
         du: increment of the present state ``(n_owned, gdim)``: contactors whose gaps are wider than both sides go stay open.
+        left: part of the right-hand side that a kept condensation may leave.
 
     Returns:
         The solution, or None if none has been found.
     """
-    comm, space, slots, first = bodies.comm, test.space, [], 0
+    comm, space, slots, first, kept = bodies.comm, test.space, [], 0, solver.slots
     few = space.block * space.n_global <= FACTORISED_UP_TO[space.gdim] and mumps.has_schur_complements() and not space.mixed
     if not few:
         return None
     near = _near(whole.P, space, du)
+    if kept.now is not None:
+        near |= kept.now.nodes[whole.P.node]
     for pair, own in equations.items():
         slots.append(_Slots.of(pair, own, first, near[first : first + len(own)]))
         first += len(own)
@@ -150,23 +162,46 @@ def settle(
     number, refused = reduced(comm, np.array([sum(len(one.rows) for one in slots), not described], dtype=np.int64))
     if refused or not 0 < number <= MOST_SLOTS:
         return None
-    condensed = _condensed(bodies, whole, test, np.concatenate([one.rows for one in slots]), G)
-    if condensed is None:
+    coordinates = _coordinates(bodies, whole, test, np.concatenate([one.rows for one in slots]))
+    if coordinates is None:
         return None
     for nodes, forces in known_forces(list(equations)):
         F.array[: bodies.forces.size] += bodies.config.add_at_owners(nodes, forces).ravel()
-    load, gap = condensed.load(F), whole.P.gap
+    gap = whole.P.gap
     normal, tangents = (np.concatenate([getattr(one, name) for one in slots]) for name in ("normal", "tangents"))
     limits = [np.concatenate(parts) for parts in zip(*(one.limits() for one in slots))]
     slip = np.where(tangents >= 0, gap[tangents], 0.0)
-    arrays = [on_root(comm, a) for a in (*map(condensed.numbers, (normal, tangents)), gap[normal], slip, *limits)]
-    found = coulomb.solve(coulomb.SlotProblem(condensed.stiffness, load, *arrays)) if comm.rank == 0 else None
-    told = comm.bcast(None if found is None else (_states(found, *arrays[1:4:2]), found.negative, found.indefinite))
+
+    def solved_by(condensed: Condensation) -> tuple[Any, ...] | None:
+        """States and flags of the solution, to which the condensation has moved (collective)."""
+        arrays = [on_root(comm, a) for a in (*map(condensed.numbers, (normal, tangents)), gap[normal], slip, *limits)]
+        condensed.begin(F)
+        forces, found, w = condensed.forces(), None, np.zeros(len(condensed.stiffness))
+        for n in range(MOST_PASSES):
+            if comm.rank == 0:
+                load = forces - condensed.stiffness @ w
+                found = coulomb.solve(coulomb.SlotProblem(condensed.stiffness, load, *arrays), w)
+            if comm.bcast(found is None if comm.rank == 0 else None):
+                return None
+            condensed.move(found.w - w if found is not None else None)
+            w = found.w if found is not None else w
+            forces = condensed.forces()
+            if condensed.balanced(found.force if found is not None else None, left) or not (n or condensed.moved_on):
+                return comm.bcast(None if found is None else (_states(found, *arrays[1:4:2]), found.negative, found.indefinite))
+        return None
+
+    of, told, condensed = (*coordinates, bodies.tangent.K, G), None, kept.now
+    if condensed is not None and condensed.serves(coordinates[0]):
+        condensed.use(*of)
+        told = solved_by(condensed)
+    if told is None and (condensed := kept.make(space, *of)) is not None:
+        told = solved_by(condensed)
     solved = None
-    if told is not None:
-        moved = condensed.moved(found.w if found is not None else None)
-        solved = Solved(moved, condensed.negative != told[1], condensed.indefinite or told[2])
-    condensed.destroy()
+    if told is not None and condensed is not None:
+        flags = condensed.negative != told[1], condensed.indefinite or told[2]
+        solved = Solved(condensed.moved(), *flags, condensed.left if condensed.moved_on else 0.0)
+    if not solver.lasting:
+        kept.drop()
     if told is None:
         return None
     begins = sum(comm.allgather(len(normal))[: comm.rank])
@@ -185,8 +220,10 @@ def _near(equations: UnitingEquations, space: Nodes, du: Array) -> Bools:
     return np.asarray(eq.gap <= reach)
 
 
-def _condensed(bodies: Bodies, whole: ContactRows, test: Restriction, rows: Ints, G: PETSc.Mat | None) -> Condensation | None:
-    """The bodies condensed onto the slots of some ``rows``; None if these cannot be eliminated together (collective)."""
+def _coordinates(
+    bodies: Bodies, whole: ContactRows, test: Restriction, rows: Ints
+) -> tuple[RelativeCoordinates, RelativeCoordinates] | None:
+    """Coordinates of motions and forces, with slots of some ``rows``; None if these cannot be eliminated together (collective)."""
     of_slots = np.zeros(len(whole), dtype=bool)
     of_slots[rows] = True
 
@@ -199,10 +236,7 @@ def _condensed(bodies: Bodies, whole: ContactRows, test: Restriction, rows: Ints
         back = trial if whole.moved is None else coordinates(whole.rows)
     except (ConflictError, DependentRingError):
         return None
-    if trial.T.rings is not None or back.T.rings is not None:
-        return None
-    condensed = Condensation(test.space, trial, back, bodies.tangent.K, G)
-    return None if reduced(bodies.comm, int(condensed.stiffness is None)) else condensed
+    return None if trial.T.rings is not None or back.T.rings is not None else (trial, back)
 
 
 def _states(found: coulomb.SlotState, tangents: Ints, slip: Array) -> Sequence[Any]:

@@ -83,6 +83,7 @@ class Exchanges:
     """Chooses among the contactors that violate their conditions, in all pairs; all methods are collective.
 
     Attributes:
+        frictional: whether any contact has friction.
         straight: whether the linearised problem neglects the curvature of contact, and softening where bodies may jump.
         may_jump: whether bodies may come down to another equilibrium from a path that has become unstable; not along an arc.
         convex: whether terms of the curvature that could make the tangent indefinite are neglected. Beyond a limit point, Newton's
@@ -94,7 +95,7 @@ class Exchanges:
 
     def __init__(self, pairs: Sequence[Interface]):
         self._pairs = pairs
-        self._frictional, self.may_jump = any(pair.friction is not None for pair in pairs), True
+        self.frictional, self.may_jump = any(pair.friction is not None for pair in pairs), True
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -137,7 +138,7 @@ class Exchanges:
         #: Contactors that have changed state in this problem, and by the present rule.
         self._changed, self._lately = self._none(), self._none()
 
-    def take_long(self, violated: Sequence[Violations], cheap: bool) -> bool:
+    def take_long(self, violated: Sequence[Violations], cheap: bool, gives_way: bool = False) -> bool:
         """Whether the problem is now to be solved on arrays, which counts as an exchange (collective).
 
         It is not if contactors touch that have no rows yet: arrays hold those with rows alone.
@@ -145,7 +146,9 @@ class Exchanges:
         Args:
             violated: violations of every pair.
             cheap: whether an exchange needs no factorisation.
+            gives_way: whether it needs one with friction that serves for all problems.
         """
+        cheap = cheap and not (gives_way and self.frictional)
         made = self._number >= (AS_LONG_IF_CHEAP if cheap else 0) and not (self.held or self._were_held or self.frozen)
         if self._on_arrays or not made or not self._pairs:
             return False
@@ -187,7 +190,7 @@ class Exchanges:
                 return None
             self._let_limits_follow(violated)
             return violated
-        free = self._frictional and not self.held
+        free = self.frictional and not self.held
         far = free and way > FAR * self._pairs[0].config.size and self._known is not None
         if free and not far:
             self._known = self._here(violated)
@@ -204,7 +207,7 @@ class Exchanges:
         elif rule == Rule.FIRST:
             chosen = self._first(violated)
         elif rule == Rule.NONE:
-            if not self._frictional or self.frozen:
+            if not self.frictional or self.frozen:
                 raise self._circle(self._lately)
             self._pivoting, self.frozen = Pivoting(), True
             return self.choose(violated, gaps, curved)
@@ -341,10 +344,10 @@ class Exchanges:
         found = sorted(chain(*self._pairs[0].config.comm.allgather(own)), key=lambda f: (f[1], f[0]))
         names = ", ".join(f"{name} at {place}" for _, name, place in found[:NAMED])
         more = f", and {len(found) - NAMED} more" if len(found) > NAMED else ""
-        why = "touch and separate, or stick and slip" if self._frictional else "touch and separate"
-        return (FrictionError if self._frictional else ConvergenceError)(
+        why = "touch and separate, or stick and slip" if self.frictional else "touch and separate"
+        return (FrictionError if self.frictional else ConvergenceError)(
             f"the active set cycles: contactors {why} in turn: {names}{more}; take smaller load steps, or a target of finer "
-            f"facets there{', or less friction' if self._frictional else ''}"
+            f"facets there{', or less friction' if self.frictional else ''}"
         )
 
 

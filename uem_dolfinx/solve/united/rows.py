@@ -178,11 +178,14 @@ class Rows:
         """Whether some of the equations depend on others."""
         return self.independent is not None and self.independent.found
 
-    def settle(self, bodies: Bodies, F: PETSc.Vec, G: PETSc.Mat | None, du: Array) -> Solved | None:
+    def settle(
+        self, bodies: Bodies, solver: UnitedSolver, F: PETSc.Vec, G: PETSc.Mat | None, du: Array, left: float
+    ) -> Solved | None:
         """Solve the linearised problem on arrays, with all conditions of contact, see ``slots.settle`` (collective)."""
         from uem_dolfinx.solve.slots.settle import settle
 
-        return None if self.conflict else settle(bodies, dict(zip(self.pairs, self.equations)), self.whole, self.test, F, G, du)
+        own = dict(zip(self.pairs, self.equations))
+        return None if self.conflict else settle(bodies, solver, own, self.whole, self.test, F, G, du, left)
 
     def of(self, pairs: Sequence[Interface]) -> list[ContactRows]:
         """Equations of each of these pairs; empty for pairs without equations."""
@@ -224,19 +227,6 @@ class BodyState(IterationState):
             solver.set_operator(self.trial, K, G, self.test, roughly)
         else:
             solver.take(self.solved, self.trial, K, G, self.test)
-
-    def settle_ahead(
-        self, bodies: Bodies, solver: UnitedSolver, pairs: Sequence[Interface], F: Callable[[], PETSc.Vec], G: PETSc.Mat | None
-    ) -> Solved | None:
-        """Solve the first problem of a time step with friction on arrays, see ``Rows.settle``, if other states are factorised anew.
-
-        Contactors within reach are those that the velocity of the last step's end brings together (collective).
-        """
-        dynamics = bodies.dynamics
-        if dynamics is None or solver.lasting or solver.iterative or not any(pair.friction is not None for pair in pairs):
-            return None
-        du = dynamics.dt * dynamics.velocity.x.array[: bodies.forces.size].reshape(-1, bodies.config.gdim)
-        return self.rows.settle(bodies, F(), G, du)
 
     def with_pressures(self, K: PETSc.Mat, G: PETSc.Mat | None) -> BodyState:
         """The state with the derivatives of heat by pressures, if pressures are forces of single contactors (collective).

@@ -22,14 +22,14 @@ from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed,
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
-from uem_dolfinx.solve.bodies.field_scales import first
+from uem_dolfinx.solve.bodies.field_scales import first, ratio
 from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, known_forces, slip_terms, together
-from uem_dolfinx.solve.rigid.first_touch import nodes_beside, touch_ahead
+from uem_dolfinx.solve.rigid.first_touch import nodes_beside, touch_ahead, way_ahead
 from uem_dolfinx.solve.rigid.floating import FloatingBodies
 from uem_dolfinx.solve.rigid.unheld import refuse_bare
 from uem_dolfinx.solve.united import rows as united_rows
 from uem_dolfinx.solve.united.exchanges import Exchanges, count
-from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.newton import FORCING, Increment, InEquilibrium, IterationState, LinearisedProblem
 from uem_dolfinx.solve.united.normal_return import move_back
 from uem_dolfinx.solve.united.rows import BodyState, OverConstraints, Rows, make_rows
 
@@ -290,8 +290,10 @@ class BodySystem:
                 along = self._across(pair)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated[k] = pair.violated(gaps[k], forces[k], least, near, self._swept, moved)
-            costly = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap)
-            if costly and (solved := state.rows.settle(self.bodies, self.residual(), self.curvature, increment)):
+            arrays = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap, self.solver.gives_way)
+            if arrays and (
+                solved := state.rows.settle(self.bodies, self.solver, self.residual(), self.curvature, increment, left)
+            ):
                 return self._with_rows(state, solved)
             climbs = self.exchanges.softens and self.exchanges.climbs(self.solver, step)
             any_left = violated if self._adrift and count(self.pairs, violated) else None
@@ -394,8 +396,10 @@ class BodySystem:
         if iteration is not None:
             self._differentiate(first=iteration == 0)
         assert isinstance(state, BodyState)
-        if iteration == 0 and (solved := state.settle_ahead(self.bodies, self.solver, self.near, self.residual, self.curvature)):
-            state = self._with_rows(state, solved)
+        if iteration is not None and (way := way_ahead(self.bodies, self.solver, self.near, iteration == 0)) is not None:
+            left = 0.0 if self.bodies.dynamics else FORCING * (min(ratio(state.norm, state.scale), 1.0) if iteration else 1.0)
+            solved = state.rows.settle(self.bodies, self.solver, self.residual(), self.curvature, way, left)
+            state = state if solved is None else self._with_rows(state, solved)
         K, P, Q, c = self.bodies.tangent.K, state.trial, state.test, state.trial.c
         state = state.with_pressures(K, self.curvature) if self._heats else state
         curvature = together(self.curvature, state.added)
@@ -408,8 +412,8 @@ class BodySystem:
         return LinearisedProblem(
             state=state,
             rhs=-Q.transpose(self._predicted_forces(state, c, forms.product(K, c))),
-            exact=not self.solver.inexact and (self.bodies.dynamics is not None or not passing),
-            iterative=self.solver.inexact,
+            exact=state.solved is not None or (not self.solver.inexact and (self.bodies.dynamics is not None or not passing)),
+            iterative=self.solver.inexact and state.solved is None,
             passing=passing,
             fits=linear or (self.linear is not None and self.linear.joints_led(CLOSED * self.config.size)),
             convex=self.exchanges.convex,
@@ -425,7 +429,7 @@ class BodySystem:
         if near is None:
             some = None if self.floating.neutral or (self.pairs and self.far_apart.any) else [p.nodes for p in self.pairs]
             dq = self.solver.complete(dq, some)
-        return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, 0.0 if self.solver.exact else accuracy)
+        return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, self.solver.left(accuracy))
 
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
         """The increment in all unknowns, if the last solve was condensed onto the contact (collective)."""
