@@ -13,8 +13,25 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
+from body_scenes import surface_of
 from dolfinx import fem
-from helpers import CELLS, M, at, box, clamp, complementary, factors, highest, linear, modulus, refused, run, scene, st_venant
+from helpers import (
+    CELLS,
+    M,
+    at,
+    box,
+    clamp,
+    complementary,
+    factors,
+    highest,
+    linear,
+    modulus,
+    refused,
+    run,
+    scene,
+    slow,
+    st_venant,
+)
 from mortar_scenes import COMM, Blocks, disturbed
 
 import uem_dolfinx as uem
@@ -300,3 +317,25 @@ def test_what_does_not_go_with_mortar():
         uem.ConflictError, ["high on low", "one pass"],
         lambda: uem.UnitedProblem(linear(b.u, b.E), b.u, bcs=b.bcs, contacts=both),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "cell, degree", [("quadrilateral", 1), slow("hexahedron", 1), slow("tetrahedron", 1), slow("triangle", 2)]
+)
+def test_whole_surfaces_of_thin_bodies(cell, degree):
+    """Of bodies as thin as half a facet is long, the far sides are not in each other: all of both press as the sides that face do."""
+    g = 2 if cell in ("triangle", "quadrilateral") else 3
+    forces = []
+    for whole in (True, False):
+        low = box(cell, [-4.0, *[-2.0] * (g - 2), -1.0], [4.0, *[2.0] * (g - 2), 0.0], [4, *[2] * (g - 2), 1])
+        high = box(cell, [-2.0, *[-4.0] * (g - 2), 0.0], [2.0, *[4.0] * (g - 2), 1.0], [2, *[4] * (g - 2), 1])
+        s = scene(COMM, cell, [low, high])
+        V = compat.function_space(s.mesh, degree, (g,))
+        u = fem.Function(V)
+        sides = [surface_of(s, k) if whole else s.tag(f"side {k}", k, at(g - 1, 0.0)) for k in (1, 0)]
+        bcs = clamp(V, s.tag("base", 0, at(g - 1, -1.0))) + clamp(V, s.tag("lid", 1, at(g - 1, 1.0)), g - 1, value=-0.01)
+        bcs += [bc for c in range(g - 1) for bc in clamp(V, s.tag("lid", 1, at(g - 1, 1.0)), c)]
+        contact = uem.Contact(*sides, coupling="mortar")
+        run(uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact], rtol=1e-11))
+        forces.append(contact.resultant().force)
+    assert np.abs(forces[0] - forces[1]).max() < 1e-7 * forces[0][-1]

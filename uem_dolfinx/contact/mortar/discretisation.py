@@ -138,7 +138,9 @@ class Mortar(Contactors):
         surface, config, nn = self.surface, self.config, self.surface.dofs.shape[1]
         x = surface.x
         away = np.linalg.norm(points - nearest.foot, axis=1) if self.target.n_nodes else np.abs(nearest.height)
-        away = config.from_owners(self.nodes, away[:, None], surface.dofs.ravel())[:, 0].reshape(-1, nn)
+        seen = np.column_stack([away, nearest.height, nearest.normal])
+        seen = config.from_owners(self.nodes, seen, surface.dofs.ravel()).reshape(-1, nn, seen.shape[1])
+        away = seen[:, :, 0]
         size = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2).max(axis=1) * 2
         near = np.ones(len(x), dtype=bool)
         if self.target.n_nodes and self.sliding == "finite":
@@ -147,7 +149,10 @@ class Mortar(Contactors):
         planes = Planes.of(surface.shape, x, surface.sign).take(facets)
         reach = away[facets].max(axis=1, initial=0.0) / FACING + 0.5 * size[facets]
         if isinstance(self.target, MeshTarget):
-            pieces = self._over_segments(planes, x[facets], facets, reach)
+            # on the other side of their body facets look away from what is in front of them, and are not inside what is behind that
+            cosine = np.einsum("mag,mg->ma", seen[facets, :, 2:], planes.normal)
+            averted = ((seen[facets, :, 1] > 0.0) & (cosine > -FACING)).all(axis=1) & (cosine > FACING).any(axis=1)
+            pieces = self._over_segments(planes, x[facets], facets, reach, averted)
         else:
             pieces = self._over_facets(planes, x[facets], np.where(before[facets].any(axis=1), GOES_ON_COVERING, COVERS))
         segments, pairs, to_gap, N, nodes, y, shape_operator, facing = pieces
@@ -230,8 +235,8 @@ class Mortar(Contactors):
         if "offset" in changed:
             self._united = None
 
-    def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array) -> Pieces:
-        """Segments against a mesh (collective)."""
+    def _over_segments(self, planes: Planes, x: Array, facets: Ints, reach: Array, averted: Bools) -> Pieces:
+        """Segments against a mesh, of facets ``averted (m,)`` from what they are near to only in front (collective)."""
         assert isinstance(self.target, MeshTarget)
         shape = self.target.shape
         keys = self.surface.keys[facets]
@@ -241,7 +246,7 @@ class Mortar(Contactors):
         # facets farther away than the reach have no contact
         weight = np.bincount(s.pair, s.weight, minlength=len(e))
         mean = np.bincount(s.pair, s.weight * s.gap, minlength=len(e)) / np.where(weight > 0, weight, 1.0)
-        upon = (weight > 0) & (np.abs(mean) <= reach[e])
+        upon = (weight > 0) & (np.abs(mean) <= reach[e]) & ~(averted[e] & (mean < 0.0))
         kept, number = upon[s.pair], np.cumsum(upon) - 1
         s = Segments(number[s.pair[kept]], s.xi[kept], s.eta[kept], s.weight[kept], s.gap[kept])
         e, y = e[upon], found.x[upon]
