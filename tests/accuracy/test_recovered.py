@@ -112,7 +112,7 @@ def test_linear_stresses(cell):
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("degree, finer", [(1, 2.0), (2, 1.0), slow(1, 1.0), slow(2, 2.0)])
 def test_contact(degree, finer, coupling):
-    """Two half-planes that touch up to a point (Westergaard), where stresses have no second order, on five meshes at slow."""
+    """Two half-planes that touch up to a point (Westergaard), where stresses have no second order."""
     ratios = []
     for n in (4, 8):
         s = signorini(n, degree=degree, finer=finer)
