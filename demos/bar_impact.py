@@ -18,8 +18,8 @@ Options:
 # during contact, the pressure rises from 300 to 500 in the first contact. The bar leaves vibrating, so that it falls from 500 to 300 in
 # the second; then all begins anew.
 #
-# Contactors with mass collide with the wall: the trapezoidal rule throws them to and fro and feeds energy into the bar at every
-# touch. Their mass is therefore handed on to the nodes around, which keeps mass, centre and moments of inertia.
+# Contactors with mass collide with the wall, which takes some energy; held by it, their velocity changes its sign in every step, and the
+# pressure alternates about the exact one. By default their mass is handed on to the nodes around, which keeps mass, centre and inertia.
 
 # %%
 import common
@@ -36,7 +36,7 @@ c = np.sqrt(E / rho)
 
 # %% [markdown]
 # ## One bar
-# Touches and departures are found within a thousandth of a step, unless the contactors have mass: those knock without end.
+# Touches and departures are found within a thousandth of a step, unless the contactors have mass.
 
 
 # %%

@@ -73,6 +73,7 @@ def test_a_failed_attempt_leaves_nothing(name):
         slow("condensed", "tetrahedron", 0.3, linear), slow("modified", "quadrilateral", 0.3, st_venant),
         slow("hypre", "tetrahedron", None, linear), slow("hypre", "tetrahedron", 0.3, linear),
         slow("hypre", "tetrahedron", 0.3, st_venant), slow("hypre", "quadrilateral", 0.3, linear),
+        ("gamg", "quadrilateral", 0.3, linear),
     ],
 )  # fmt: skip
 def test_factors_and_preconditioners_come_back(solver, cell, mu, law, monkeypatch):
@@ -83,7 +84,7 @@ def test_factors_and_preconditioners_come_back(solver, cell, mu, law, monkeypatc
         monkeypatch.setattr(Condensed, "_is_cheaper", lambda *_: False)
     made, set_up = [], UnitedSolver._set_up
     monkeypatch.setattr(UnitedSolver, "_set_up", lambda self, **options: made.append(set_up(self, **options)))
-    options = {"ksp_type": "cg", **uem.multigrid_options("hypre")} if solver == "hypre" else DIRECT
+    options = {"ksp_type": "cg", **uem.multigrid_options(solver)} if solver in ("hypre", "gamg") else DIRECT
     how = {"petsc_options": options} | ({"newton": "modified", "max_iterations": 200} if solver == "modified" else {})
 
     def run(failing):

@@ -34,7 +34,7 @@ class UnitedSolver(KspOfOptions):
     PETSc's ``options`` are given without ``prefix``; defaults depend on the size. Without ``ksp_rtol`` the tolerance follows Newton.
     """
 
-    parts = "_kept", "_preconditioner", "condensed", "slots"
+    parts = "_kept", "_preconditioner", "condensed", "slots", "_united", "_unsymmetric"
 
     def __init__(self, space: Nodes, prefix: str, options: dict[str, Any] | None):
         self.space = space

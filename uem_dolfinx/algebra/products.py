@@ -28,6 +28,7 @@ from uem_dolfinx.algebra.blocks import (
     to_owners,
     together,
 )
+from uem_dolfinx.algebra.kept_factor import Returning
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints, among
 from uem_dolfinx.geometry.nodes import Nodes
@@ -55,7 +56,7 @@ def made_of(P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, r
     return K, *gathered(P.space.comm, np.array(parts, dtype=np.int64)).ravel().tolist()
 
 
-class UnitedMatrix:
+class UnitedMatrix(Returning):
     """``Q'(K + G)P`` for successive K, in the same matrix as long as its sparsity is unchanged.
 
     Args:
@@ -79,6 +80,11 @@ class UnitedMatrix:
         self._begins = False
         #: Entries of K changed by the last update: blocks, positions of their lines, positions of single entries in matrix and K.
         self._changed: tuple[Blocks, Ints, Ints, Ints] | None = None
+
+    def restore(self) -> None:
+        """Bring back the matrix of the last accepted step, which preconditioners hold; its values are computed anew (collective)."""
+        super().restore()
+        self._changed, self._state = None, -1
 
     def begin_step(self) -> None:
         """Make the sparsity independent of earlier steps, so that a run restarted from a checkpoint has the same."""
