@@ -73,7 +73,7 @@ def test_a_failed_attempt_leaves_nothing(name):
         slow("condensed", "tetrahedron", 0.3, linear), slow("modified", "quadrilateral", 0.3, st_venant),
         slow("hypre", "tetrahedron", None, linear), slow("hypre", "tetrahedron", 0.3, linear),
         slow("hypre", "tetrahedron", 0.3, st_venant), slow("hypre", "quadrilateral", 0.3, linear),
-        ("gamg", "quadrilateral", 0.3, linear),
+        slow("gamg", "quadrilateral", 0.3, linear),
     ],
 )  # fmt: skip
 def test_factors_and_preconditioners_come_back(solver, cell, mu, law, monkeypatch):
