@@ -191,7 +191,8 @@ def test_friction_never_gives_energy(how):
     # under mortar weights of sticking contactors change within the step
     least = 1e-5 * run.friction[-1] if how.get("coupling") else 1e-14 * run.start
     assert dissipated.min() >= -least and run.friction[-1] > 1e-3 * run.start
-    assert np.abs(run.force[:, 0]).max() <= 0.3 * run.force[:, -1].max() * (1 + 1e-9)
+    # normals lean by no more than strains
+    assert (np.abs(run.force[:, 0]) <= (0.3 + SPEED) * run.force[:, -1]).all()
     assert -run.contact[-1] >= run.friction[-1] * (1 - 1e-9)
     assert np.abs(run.defect).max() <= 1e-9 * run.start
 
