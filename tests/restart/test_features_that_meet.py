@@ -122,16 +122,24 @@ def cohesion_pressed_then_sheared(L, S):
     return meeting(b, contact, loads(steps), F=b.F + P * b.v[1] * ufl.dx)
 
 
-def explicit_steps_with_friction(L, S):
-    b = Blocks(L, S, gap=0.01)
+def explicit_steps_with_friction(L, S, contact=None, layers=3, contactors="massy", speed=0.015, end=0.7):
+    b = Blocks(L, S, gap=0.01, layers=layers)
     velocity = fem.Function(b.V)
-    velocity.x.array.reshape(-1, 2)[b.V.tabulate_dof_coordinates()[:, 1] > 0.005 * L] = np.sqrt(S) * np.array([0.015, -0.05])
-    how = {"velocity": velocity, "scheme": uem.CentralDifferences(), "contactors": "massy"}
+    velocity.x.array.reshape(-1, 2)[b.V.tabulate_dof_coordinates()[:, 1] > 0.005 * L] = np.sqrt(S) * np.array([speed, -0.05])
+    how = {"velocity": velocity, "scheme": uem.CentralDifferences(), "contactors": contactors}
 
     def steps(problem, checkpoint):
-        return uem.time_steps(problem, None, 0.7 * L / np.sqrt(S), checkpoint=checkpoint)
+        return uem.time_steps(problem, None, end * L / np.sqrt(S), checkpoint=checkpoint)
 
-    return meeting(b, uem.GeneralContact(friction=0.3), steps, dynamics=uem.Dynamics(uem.lumped_mass(b.V, 1.0), **how))
+    own = uem.GeneralContact(friction=0.3) if contact is None else contact(b)
+    return meeting(b, own, steps, dynamics=uem.Dynamics(uem.lumped_mass(b.V, 1.0), **how))
+
+
+def explicit_steps_by_mortar(L, S):
+    def contact(b):
+        return uem.Contact(b.foot, b.top, friction=0.3, coupling="mortar")
+
+    return explicit_steps_with_friction(L, S, contact, 6, "massless", 0.03, 1.5)
 
 
 def adhesion_in_time(L, S):
@@ -222,6 +230,7 @@ MEETINGS = [
     friction_under_a_coupling,  soft_in_general, adhesion_pulled_off, wear_in_steps, self_contact_with_friction,
     arc_with_friction, follower_load_and_self_contact, cohesion_pressed_then_sheared, explicit_steps_with_friction, adhesion_in_time,
     slider_and_adhesion, soft_in_general_under_a_coupling, leak_and_wear, cohesion_in_general, film_in_time, explicit_steps_about_a_hinge,
+    explicit_steps_by_mortar,
 ]  # fmt: skip
 meetings = pytest.mark.parametrize("make", MEETINGS, ids=lambda f: f.__name__)
 

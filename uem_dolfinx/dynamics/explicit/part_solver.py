@@ -25,6 +25,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import compiling, timed
+from uem_dolfinx.parallel import gathered
 
 
 class PartSolver(UnitedSolver):
@@ -77,10 +78,10 @@ class PartSolver(UnitedSolver):
         """Factorise a matrix of owned ``nodes (k,)``, with entries ``idle (k block,)`` on the diagonal of idle unknowns (collective)."""
         space, g = self.space, self.space.block
         self._at, self._pc = (g * nodes[:, None] + np.arange(g)).ravel(), None
-        size = space.comm.allreduce(len(nodes))
+        counts = gathered(space.comm, len(nodes))
+        size, first = int(counts.sum()), int(counts[: space.comm.rank].sum())
         if not size:
             return
-        first = int(space.comm.scan(len(nodes))) - len(nodes)
         numbers = np.zeros((space.n_owned, 1), dtype=np.int64)
         numbers[nodes, 0] = first + np.arange(len(nodes))
         A = to_owners(space, A)
@@ -251,7 +252,7 @@ class Prediction:
         if system.rows is None:
             # the first step of a run that goes on
             bodies.update_tangent()
-            system.rows_of_last()
+        system.rows_of_last()
         if not self.kept:
             self._prepare()
         u = np.array(start)

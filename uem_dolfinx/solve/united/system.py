@@ -234,8 +234,9 @@ class BodySystem:
         return np.asarray(np.einsum("ng,ng->n", normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
     def rows_of_last(self) -> Rows:
-        """Equations of the last state; at the beginning of a run, or if it goes on, those at the last projection (collective)."""
-        self.rows = self.rows or self.present_rows()
+        """Equations of the last state; those at the last projection if a run begins or goes on, and of mortar (collective)."""
+        if self.rows is None or not all(pair.discretisation.traits.two_pass for pair in self.near):
+            self.rows = self.present_rows()
         return self.rows
 
     def present_rows(self) -> Rows:
