@@ -14,13 +14,15 @@ import numpy as np
 import pytest
 import ufl
 from bar_scenes import Bar
+from body_scenes import Bodies
 from dolfinx import fem
-from helpers import at, box, highest, modulus, refused, scene, slow
+from helpers import at, box, highest, linear, modulus, refused, scene, slow
 from restart_scenes import goes_on_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.parallel import reduced
+from uem_dolfinx.solve.united.system import BodySystem
 
 COMM = MPI.COMM_WORLD
 SPEED, WIDTH = 1e-2, 0.3
@@ -266,6 +268,21 @@ def test_what_is_refused():
     bars = Bars()
     with pytest.raises(uem.InputError, match="massy"), uem.recording(bars.problem):
         pass
+
+
+def test_methods_that_give_energy_are_warned_of(caplog):
+    """Systems other than elimination pass contact forces on to the next step, unless contactors have no mass."""
+
+    class Other(BodySystem):
+        """A system of a user."""
+
+    for contactors, warned in (("massy", True), ("massless", False)):
+        caplog.clear()
+        b = Bodies("quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [4, 6])])
+        dynamics = uem.Dynamics(uem.lumped_mass(b.V, 1.0), contactors=contactors)
+        contact = uem.Contact(b.side(0, 1, 0.0), uem.RigidPlane((0.0, 0.0), (0.0, 1.0)))
+        uem.UnitedProblem(linear(b.u, 1.0), b.u, contacts=[contact], dynamics=dynamics, method=Other)
+        assert COMM.rank != 0 or ("every touch adds energy" in caplog.text) == warned
 
 
 def test_a_bar_on_a_wall():

@@ -234,7 +234,7 @@ class UnitedProblem(given.Sealed):
         self.set_at: float | None = None
         self.history: Any = None  # record of all steps for gradients
         self.impacts: Any = None  # contacts that act for whole steps
-        if dynamics is not None and dynamics.contactors == "massy" and method is BodySystem:
+        if dynamics is not None and dynamics.contactors == "massy":
             from uem_dolfinx.solve.united.impacts import impacts_of
 
             self.impacts = impacts_of(self)

@@ -26,9 +26,11 @@ from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.dynamics.massless import followed_by, united_accelerations
 from uem_dolfinx.dynamics.scheme import Scheme
 from uem_dolfinx.errors import InputError, MassError
+from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import agree, agreed, reduced
 from uem_dolfinx.solve.bodies.tangent import added_mass
 from uem_dolfinx.solve.united.rows import OverConstraints, Rows, make_rows, read_forces
+from uem_dolfinx.solve.united.system import BodySystem
 
 REMEDY = "leave it out, or take contactors='massless'"
 
@@ -135,9 +137,13 @@ def _sum(of: Traction, other: Traction, factor: float) -> Traction:
 
 
 def impacts_of(problem: Any) -> Impacts | None:
-    """Contacts with impacts of a problem whose contactors keep their mass; None without (collective)."""
-    dynamics = problem.dynamics
-    if dynamics is None or not isinstance(dynamics.scheme, Scheme):
+    """Contacts with impacts of a problem whose contactors keep their mass; None without, and with other methods (collective)."""
+    if not (problem.interfaces and isinstance(problem.dynamics.scheme, Scheme)):
+        return None
+    if type(problem.system) is not BodySystem:
+        logger.warning(
+            "contactors='massy': with this method, contact forces enter the accelerations, so that every touch adds energy"
+        )
         return None
     tied = {id(contact.pair.whole) for contact in problem.contacts if contact.tied is True}
     hard = [pair for pair in problem.interfaces if not (pair.trial.has_law or id(pair) in tied)]
