@@ -219,7 +219,7 @@ def keel(
     return Keel(made, problem, contact, driver, np.radians(angles))
 
 
-def on_plane(plane: Any, coupling: str, *, mu: float = 0.3, depth: float = 0.4, height: float = 0.4) -> Driven:
+def on_plane(plane: Any, coupling: str, *, mu: float = 0.3, depth: float = 0.4, height: float = 0.4, law: Any = linear) -> Driven:
     """A block that stands at a distance from the origin on a rigid plane; its top is driven."""
     s = create_scene(MPI.COMM_WORLD, "hexahedron", [box("hexahedron", [0.8, -0.2, 0.0], [1.2, depth - 0.2, height], [3, 3, 3])])
     V = compat.function_space(s.mesh, 1, (3,))
@@ -227,5 +227,5 @@ def on_plane(plane: Any, coupling: str, *, mu: float = 0.3, depth: float = 0.4, 
     low, top = s.tag("low", 0, at(2, 0.0)), s.tag("top", 0, at(2, height))
     contact = uem.Contact(low, plane, friction=mu, coupling=coupling)
     bcs = [fem.dirichletbc(driver, fem.locate_dofs_topological(V, 2, top.entities))]
-    problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact], rtol=1e-11)
+    problem = uem.UnitedProblem(law(u, 1.0), u, bcs=bcs, contacts=[contact], rtol=1e-11)
     return Driven(Blocks(s, V, u, low, low, low, top, 64), problem, contact, driver)

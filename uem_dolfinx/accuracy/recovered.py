@@ -44,7 +44,7 @@ DETERMINED = 1e-2
 #: [bound; values; test_recovered.py::test_laws_that_jump]
 MOST_VALUES = 16
 #: A smaller tangent is rounding.
-#: [derived; the cell's largest tangent; -]
+#: [bound; the cell's largest tangent; -]
 NO_WORK = 1e-10
 
 
