@@ -213,6 +213,11 @@ class Sliding:
         return stick_slip.find_violations(violated, turned, active, by, force_rounding=forces, gap_rounding=lengths)
 
     @property
+    def forced(self) -> Bools:
+        """Contactors that have slipped along prescribed components in this step ``(n,)``."""
+        return np.asarray(self.frame.forced(self.frame.away, self._lost) > GAP_ROUNDING * self.config.size)
+
+    @property
     def _lost(self) -> Bools:
         return self.left_out & ~self.discretisation.setting.free[self.nodes].all(axis=1, keepdims=True)
 
@@ -262,8 +267,7 @@ class Sliding:
         T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.ties.share[:, None]
         # prescribed components at rest carry no friction; if all are prescribed, only the moving ones do
         told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
-        least = GAP_ROUNDING * self.config.size
-        goes = (frame.forced(frame.away, self._lost) > least) | stick_slip.continues(_of(state).direction, T, frame.away, least)
+        goes = self.forced | stick_slip.continues(_of(state).direction, T, frame.away, GAP_ROUNDING * self.config.size)
         tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
         q = c[:, None] * frame.slip - tau
         self.pivot = Pivot.begin(c, q, tau)

@@ -88,7 +88,9 @@ class _Slots:
         """Whether two laws, of a gap and of a slip, describe all contactors of this rank."""
         friction, cornered = self.pair.friction, bool(self.pair.trial.in_corner.any())
         of_speed = friction is not None and slides_otherwise(friction.limits.law)
-        return not (cornered or self.pair.trial.has_law or self.pair.tie or self.pair.heats or of_speed)
+        # slip along prescribed components takes part of the friction that slots count as their own
+        led = friction is not None and bool((friction.forced[self.contactor] & (self.tangents >= 0).any(axis=1)).any())
+        return not (cornered or self.pair.trial.has_law or self.pair.tie or self.pair.heats or of_speed or led)
 
     def limits(self) -> tuple[Array, Array]:
         """Slopes of the limits of friction by the normal multiplier, and limits at zero multiplier ``(k,)`` (collective)."""
