@@ -265,6 +265,26 @@ def test_seams_of_both_bodies(coupling, degree, friction):
     assert force == pytest.approx(other, abs=1e-9 * np.abs(force).max())
 
 
+@pytest.mark.parametrize("n, degree", [((6, 5), 1), slow((5, 6), 1), slow((6, 5), 2), slow((5, 6), 2)])
+def test_nodes_of_both_bodies(n, degree):
+    """Where both bodies have a seam, and meshes do not match, equations of nodes depend on each other but for the strain."""
+    found = []
+    for coupling in ("node_to_surface", "mortar"):
+        bodies = [box("quadrilateral", [0.0, k - 1.0], [PERIOD, k], [n[k], 2]) for k in (0, 1)]
+        s = scene(COMM, "quadrilateral", bodies)
+        V = compat.function_space(s.mesh, degree, (2,))
+        u, top = fem.Function(V), s.tag("top", 1, at(1, 1.0))
+        bcs = clamp(V, s.tag("bottom", 0, at(1, -1.0))) + clamp(V, top, value=[0.0, -0.05])
+        contact = uem.Contact(s.tag("upper", 1, at(1, 0.0)), s.tag("lower", 0, at(1, 0.0)), coupling=coupling)
+        seams = [uem.periodic(*(s.tag(f"{k}{x}", k, at(0, x)) for x in (PERIOD, 0.0))) for k in (0, 1)]
+        problem = uem.UnitedProblem(linear(u, 10.0), u, bcs=bcs, contacts=[contact], equations=seams, rtol=1e-11)
+        (step,) = run(problem)
+        assert len(step.iterations) - 1 <= 4
+        found.append(contact.resultant().force)
+        assert found[-1] == pytest.approx(-problem.reaction(top), abs=1e-8)
+    assert found[0] == pytest.approx(found[1], abs=0.01 * found[1][1])
+
+
 @pytest.mark.parametrize("degree, h", [(1, 5.0), (2, 5.0), (1, lambda p, g: 0.01 * p), (1, np.inf)])
 def test_heat_across_a_seam(degree, h):
     """Blocks that are periodic and insulated at their sides conduct and press as in one dimension, on both sides of the seam."""

@@ -29,7 +29,7 @@ from uem_dolfinx.parallel import agree, gathered, reduced
 #: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
 #: do so only to the first order of their strain.
 #: [convention; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
-DEPENDENT = 0.02
+DEPENDENT = 2e-3
 #: Parts of a unit displacement below it are rounding.
 #: [derived; directions of length one; test_restriction.py::test_rings_that_fade]
 FADED = np.finfo(float).eps
