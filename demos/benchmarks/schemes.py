@@ -91,7 +91,7 @@ def draw(points: list[dict[str, Any]], path: str) -> None:
                 panel.set(
                     xticks=[0.1, 1.0] if dim == 2 else [0.1, 1.0, 10.0],
                     yticks=[5e-3, 1e-2, 2e-2, 4e-2],
-                    xlim=(0.08, 1.2 if dim == 2 else 60.0),
+                    xlim=(0.05, 1.2 if dim == 2 else 60.0),
                 )
                 panel.set(yticklabels=["0.5 %", "1 %", "2 %", "4 %"], ylim=(3.5e-3, 8e-2))
                 panel.legend(frameon=False, ncol=2, loc="upper center", fontsize="small")
