@@ -30,7 +30,7 @@ def _of_contact(name: str) -> property:
 
 
 class FurtherPart(Contact):
-    """Part of a contact, with arguments of its own in place of the contact's; ``order`` as in ``Traits``. The contact tells its results."""
+    """Part of a contact, with arguments of its own in place of the contact's; ``order`` as in ``Traits``. Its results are the contact's."""
 
     is_further_part = True
     #: Corners are contactors themselves, and contactors pass ends regularly.

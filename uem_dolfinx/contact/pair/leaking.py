@@ -87,7 +87,7 @@ class LeakingInterface(Interface):
     def follow(self) -> bool:
         """Let the fluid reach further contactors or leave them (collective); see ``Interface``."""
         moved = super().follow()
-        # a contact that was switched off knows of no fluid
+        # a contact that was switched off has no fluid
         before = self._inlet if self.trial.wet is None else self.trial.wet
         wet = self._reached() | (before & (self._changes > MOST_REACHED))
         changed = wet != before
@@ -99,7 +99,7 @@ class LeakingInterface(Interface):
         """The fluid's forces by the rows of gaps, as loads of both bodies (collective)."""
         if not self.asked:
             return None
-        # a contact that was switched off knows of no fluid
+        # a contact that was switched off has no fluid
         wet = self._inlet if self.trial.wet is None else self.trial.wet
         p = self._law.at(self.config.comm, self.name, float(self._contact._at))
         if self._begun is None:

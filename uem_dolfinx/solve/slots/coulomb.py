@@ -133,11 +133,11 @@ class _Newton:
         from scipy.linalg.lapack import dgesv
 
         p, S, (w, free), negative = self.problem, self.problem.stiffness, self.held(now), False
-        i, asked = np.flatnonzero(now.closed & self.frictional & ~now.stick), free.copy()
-        asked[p.normal[i]] = True
+        i, needed = np.flatnonzero(now.closed & self.frictional & ~now.stick), free.copy()
+        needed[p.normal[i]] = True
         # forces by free slots, and in the last column by held ones
         rows, place = np.zeros((len(S), free.sum() + 1)), np.cumsum(free) - 1
-        rows[asked, :-1], rows[:, -1] = S[np.ix_(asked, free)], p.load + S @ w
+        rows[needed, :-1], rows[:, -1] = S[np.ix_(needed, free)], p.load + S @ w
         if len(i):
             # tau - part (y across along) - limit along, with y = tau - c v
             e, slots, there, c = now.along[i], p.tangents[i], self.there[i], self.c[i]

@@ -192,24 +192,24 @@ def settle(
                 return comm.bcast(None if found is None else (_states(found, *arrays[1:4:2]), found.negative, found.indefinite))
         return None
 
-    of, told, condensed = (*coordinates, bodies.tangent.K, G), None, kept.now
+    of, answer, condensed = (*coordinates, bodies.tangent.K, G), None, kept.now
     if condensed is not None and condensed.serves(coordinates[0]):
         condensed.use(*of)
-        told = solved_by(condensed)
-    if told is None and (condensed := kept.make(space, *of)) is not None:
-        told = solved_by(condensed)
+        answer = solved_by(condensed)
+    if answer is None and (condensed := kept.make(space, *of)) is not None:
+        answer = solved_by(condensed)
     solved = None
-    if told is not None and condensed is not None:
-        flags = condensed.negative != told[1], condensed.indefinite or told[2]
+    if answer is not None and condensed is not None:
+        flags = condensed.negative != answer[1], condensed.indefinite or answer[2]
         solved = Solved(condensed.moved(), *flags, condensed.left if condensed.moved_on else 0.0)
     if not solver.lasting:
         kept.drop()
-    if told is None:
+    if answer is None:
         return None
     begins = sum(comm.allgather(len(normal))[: comm.rank])
     ends = begins + np.cumsum([len(one.contactor) for one in slots])
     for one, end in zip(slots, ends):
-        one.take(*(values[end - len(one.contactor) : end] for values in told[0]))
+        one.take(*(values[end - len(one.contactor) : end] for values in answer[0]))
     return solved
 
 
