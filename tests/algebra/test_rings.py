@@ -29,7 +29,7 @@ COMM = MPI.COMM_WORLD
 
 @pytest.mark.parametrize("part", [0.0, 5e-9, 0.1, 0.5, 0.997, 0.999, 1.0])
 def test_a_ring_of_equal_parts(comm, part):
-    """Each follows the next by a part: du = part du + the rest; where these parts leave 0.2 % of a row to tell, it depends on the others."""
+    """Each follows the next by a part: du = part du + the rest; where these leave 0.2 % of a row to tell, it depends on the others."""
     config = Configuration(blocks(comm, "triangle", 2, 2, gap=0.5).u)
     ring = [(0, [0.0, 1.0], 3), (3, [0.6, 0.8], 5), (5, [0.0, 1.0], 0)]
     if part > 0.998:
