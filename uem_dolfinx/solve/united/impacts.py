@@ -32,7 +32,7 @@ from uem_dolfinx.solve.bodies.tangent import added_mass
 from uem_dolfinx.solve.united.rows import OverConstraints, Rows, make_rows, read_forces
 from uem_dolfinx.solve.united.system import BodySystem
 
-REMEDY = "leave it out, or take contactors='massless'"
+WITHOUT = "leave it out, or take contactors='massless'"
 
 
 class Impacts:
@@ -86,8 +86,7 @@ class Impacts:
         """Refuse an equilibrium after time steps: no contact force is left that it could begin with."""
         if self.dynamics.last > 0.0:
             raise InputError(
-                "solve() after time steps with contactors='massy', whose contact forces act within steps: leave it out, or take "
-                "contactors='massless'"
+                f"solve() after time steps with contactors='massy', whose contact forces act within steps: {WITHOUT}"
             )
 
     def commit(self) -> None:
@@ -152,7 +151,7 @@ def impacts_of(problem: Any) -> Impacts | None:
 
 def _refuse(pair: Interface) -> None:
     """Refuse what does not go with contact forces of whole steps."""
-    friction, words = pair.friction, f"with Dynamics(..., contactors='massy') in implicit steps: {REMEDY}"
+    friction, words = pair.friction, f"with Dynamics(..., contactors='massy') in implicit steps: {WITHOUT}"
     for what, there in (
         ("a tie of contactors that also touch", pair.tie is not None),
         ("heat", bool(pair.heats)),
