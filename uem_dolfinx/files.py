@@ -23,8 +23,7 @@ from uem_dolfinx.parallel import agree, agreed
 
 T = TypeVar("T")
 
-#: Bytes that MPI-IO gets at once, because it counts them in C's int.
-#: [format; bytes; -]
+#: Bytes that MPI-IO gets at once, because it counts them in C's int. [format; bytes; -]
 PIECE = 2**30
 #: Longest path as given: Open MPI's MPI-IO overruns a buffer of 256 bytes, in which endings are appended to it.
 #: [format; bytes; -]

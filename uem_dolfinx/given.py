@@ -24,11 +24,9 @@ from uem_dolfinx.errors import InputError, InputTypeError
 
 W = TypeVar("W", bound=str)
 
-#: Values are shown with so many letters.
-#: [format; letters; -]
+#: Values are shown with so many letters. [format; letters; -]
 LONGEST = 80
-#: Prefix of the names of the package's modules.
-#: [format; -; -]
+#: Prefix of the names of the package's modules. [format; -; -]
 PACKAGE = "uem_dolfinx."
 
 

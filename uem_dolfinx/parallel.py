@@ -27,8 +27,7 @@ T = TypeVar("T")
 #: Exit status of a run that Ctrl-C to one rank has ended between what is collective, as shells have it.
 #: [format; exit status; test_signals.py::test_one_rank_is_interrupted_before_the_steps]
 INTERRUPTED = 128 + signal.SIGINT
-#: How often a rank looks whether the others have come.
-#: [bound; seconds; -]
+#: How often a rank looks whether the others have come. [bound; seconds; -]
 POLLED = 1e-3
 
 

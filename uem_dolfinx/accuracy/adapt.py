@@ -32,8 +32,7 @@ from uem_dolfinx.solve.united.newton import Iteration
 #: Cells around a point, by their centres, of which the one is taken that the point is in or next to.
 #: [bound; cells; test_first_guess.py::test_polynomials]
 CANDIDATES = 16
-#: Steps of Newton's method for the position of a point in a curved cell.
-#: [bound; iterations; -]
+#: Steps of Newton's method for the position of a point in a curved cell. [bound; iterations; -]
 INVERTED_IN = 5
 
 
@@ -119,36 +118,24 @@ AIM = 0.85
 #: [convention; size of a cell; test_adapt.py::test_sizes_change_by_a_bounded_factor]
 MOST_CHANGE = 4.0
 #: A number of cells is kept if it is met to this part; then a mesh ends the search whose estimate falls by less than this part. Under a
-#: tolerance such a mesh lets the next ones aim lower.
-#: [convention; cells, or estimate; test_adapt.py::test_a_number_of_cells]
+#: tolerance such a mesh lets the next ones aim lower. [convention; cells, or estimate; test_adapt.py::test_a_number_of_cells]
 SAME_NUMBER = 0.15
 #: A goal's estimate is trusted if the parts of its cells, without their signs, sum up to at most this multiple of the tolerance. Where they
-#: cancel little, they sum up to 0.6 to 3 times the estimate.
-#: [convention; tolerance; test_goal.py::test_errors_that_cancel]
+#: cancel little, they sum up to 0.6 to 3 times the estimate. [convention; tolerance; test_goal.py::test_errors_that_cancel]
 MOST_CANCELLED = 2.0
 
 
 @dataclass(frozen=True)
 class AdaptedMesh:
-    """One mesh of an adaptation.
+    """One mesh of an adaptation."""
 
-    Attributes:
-        cells: number of cells.
-        unknowns: number of components of displacements.
-        estimate: estimated error over the displacement, in the energy norm, or of a goal over its value.
-        parts: of a goal, the sum of the cells' parts over the value, which cannot cancel; else the same as ``estimate``.
-        iterations: of Newton, in all steps; 0 if ``solve`` returns none.
-        seconds: for the mesh, the solution and the estimate.
-        narrow: whether a contact has fewer than ``FEWEST`` facets along a direction.
-    """
-
-    cells: int
-    unknowns: int
-    estimate: float
-    parts: float
-    iterations: int
-    seconds: float
-    narrow: bool = False
+    cells: int  # number of cells
+    unknowns: int  # number of components of displacements
+    estimate: float  # estimated error over the displacement, in the energy norm, or of a goal over its value
+    parts: float  # of a goal, the sum of the cells' parts over the value, which cannot cancel; else the same as ``estimate``
+    iterations: int  # of Newton, in all steps; 0 if ``solve`` returns none
+    seconds: float  # for the mesh, the solution and the estimate
+    narrow: bool = False  # whether a contact has fewer than ``FEWEST`` facets along a direction
 
     @property
     def known(self) -> float:

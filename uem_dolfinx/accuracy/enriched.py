@@ -34,8 +34,7 @@ from uem_dolfinx.materials.elastic import differentiate
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
-#: Residual of the tractions' mass matrix, whose condition does not depend on the mesh.
-#: [bound; norm of the nodal forces; -]
+#: Residual of the tractions' mass matrix, whose condition does not depend on the mesh. [bound; norm of the nodal forces; -]
 SOLVED = 1e-10
 
 
@@ -244,16 +243,11 @@ def energy(problem: UnitedProblem) -> float:
 
 
 class FewFacets(NamedTuple):
-    """A contact that begins and ends within a few facets.
-
-    Attributes:
-        closed: number of facets of all whose contactors are active.
-        few: the least number with which estimates are trusted.
-    """
+    """A contact that begins and ends within a few facets."""
 
     name: str
-    closed: int
-    few: int
+    closed: int  # number of facets of all whose contactors are active
+    few: int  # the least number with which estimates are trusted
 
 
 def of_facets(config: Configuration, contact: Contact, values: Array) -> Array:

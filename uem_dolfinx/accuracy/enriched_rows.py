@@ -36,25 +36,17 @@ from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
 from uem_dolfinx.geometry.shapes import area_vectors, facet_shape
 from uem_dolfinx.parallel import gathered
 
-#: Points whose second derivatives are made at once, in the memory that these take.
-#: [bound; points; -]
+#: Points whose second derivatives are made at once, in the memory that these take. [bound; points; -]
 POINTS_AT_ONCE = 1000
 
 
 class Side(NamedTuple):
-    """The enriched space on facets of one side of a contact, at points of contactors.
+    """The enriched space on facets of one side of a contact, at points of contactors."""
 
-    Attributes:
-        node: global nodes ``(n, nn)``.
-        value: their functions ``(n, nn)``.
-        free: 1 for their free components ``(n, nn, gdim)``.
-        x: their positions ``(n, nn, gdim)``.
-    """
-
-    node: Ints
-    value: Array
-    free: Array
-    x: Array
+    node: Ints  # global nodes ``(n, nn)``
+    value: Array  # their functions ``(n, nn)``
+    free: Array  # 1 for their free components ``(n, nn, gdim)``
+    x: Array  # their positions ``(n, nn, gdim)``
 
 
 def curvature(
@@ -105,33 +97,21 @@ PIECES = 4
 
 
 class EnrichedRows(NamedTuple):
-    """Entries of the equations that this rank has integrated.
+    """Entries of the equations that this rank has integrated."""
 
-    Attributes:
-        row: global number of the equation ``(k,)``.
-        node: global node of the enriched space ``(k,)``.
-        value: entries at its components, zero where these are prescribed ``(k, gdim)``.
-        force: the same of the forces of its multiplier, which differ from these where contactors slip with friction ``(k, gdim)``.
-        gap_row: global number of the equation of each part of a gap ``(j,)``.
-        gap: parts of the weighted gaps ``(j,)``.
-        active: whether the solution's contactors of the rank's own equations are active ``(m,)``.
-        tied: whether their equations always are ``(m,)``.
-        own: owned nodes of the enriched space that they belong to ``(m,)``.
-        curvature: global components of rows and columns of the stiffness that contacts add, and values ``(l,)`` each.
-        first: first equation of every rank, and one past the last.
-    """
-
-    row: Ints
-    node: Ints
-    value: Array
+    row: Ints  # global number of the equation ``(k,)``
+    node: Ints  # global node of the enriched space ``(k,)``
+    value: Array  # entries at its components, zero where these are prescribed ``(k, gdim)``
+    #: the same of the forces of its multiplier, which differ from these where contactors slip with friction ``(k, gdim)``.
     force: Array
-    gap_row: Ints
-    gap: Array
-    active: Bools
-    tied: Bools
-    own: Ints
+    gap_row: Ints  # global number of the equation of each part of a gap ``(j,)``
+    gap: Array  # parts of the weighted gaps ``(j,)``
+    active: Bools  # whether the solution's contactors of the rank's own equations are active ``(m,)``
+    tied: Bools  # whether their equations always are ``(m,)``
+    own: Ints  # owned nodes of the enriched space that they belong to ``(m,)``
+    #: global components of rows and columns of the stiffness that contacts add, and values ``(l,)`` each.
     curvature: tuple[Ints, Ints, Array]
-    first: Ints
+    first: Ints  # first equation of every rank, and one past the last
 
 
 def enriched_rows(enriched: Enriched) -> EnrichedRows:

@@ -41,8 +41,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 #: With fewer facets in contact along each direction of the surface, the solution of one degree more has another contact.
 #: [convention; facets; test_goal.py::test_few_facets_in_contact]
 FEW = 3
-#: Changes of the active set in the linear problem of a goal's error.
-#: [bound; factorisations; -]
+#: Changes of the active set in the linear problem of a goal's error. [bound; factorisations; -]
 MOST_SETS = 10
 
 

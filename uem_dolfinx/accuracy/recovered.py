@@ -43,8 +43,7 @@ DETERMINED = 1e-2
 #: Patches end where Functions that are constant in cells jump, unless they have more values than this.
 #: [bound; values; test_recovered.py::test_laws_that_jump]
 MOST_VALUES = 16
-#: A smaller tangent is rounding.
-#: [bound; the cell's largest tangent; -]
+#: A smaller tangent is rounding. [bound; the cell's largest tangent; -]
 NO_WORK = 1e-10
 
 

@@ -16,17 +16,11 @@ from uem_dolfinx.parallel import Exchange, reduced
 
 
 class Blocks(NamedTuple):
-    """Blocks of a sparse matrix; blocks with the same row and column are summed.
+    """Blocks of a sparse matrix; blocks with the same row and column are summed."""
 
-    Attributes:
-        row: global node of each block's components ``(k,)``.
-        column: global node of the unknowns that they take ``(k,)``.
-        value: ``(k, block, block)``.
-    """
-
-    row: Ints
-    column: Ints
-    value: Array
+    row: Ints  # global node of each block's components ``(k,)``
+    column: Ints  # global node of the unknowns that they take ``(k,)``
+    value: Array  # ``(k, block, block)``
 
     def some(self, which: Any) -> Blocks:
         """The blocks selected by a mask or indices."""

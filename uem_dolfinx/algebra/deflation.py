@@ -39,8 +39,7 @@ MODES_OF_THEIR_OWN = 4
 #: A mode of which less than this part is new adds nothing to those before it.
 #: [convention; part of its norm; test_linear_solver.py::test_modes_that_are_nearly_alike]
 INDEPENDENT = 1e-6
-#: Workspace of MUMPS beyond its estimate, which does not always do on several ranks; ``W'AW`` is small.
-#: [bound; per cent; -]
+#: Workspace of MUMPS beyond its estimate, which does not always do on several ranks; ``W'AW`` is small. [bound; per cent; -]
 PLENTY = 200
 
 

@@ -27,26 +27,17 @@ NEGLIGIBLE = 1e-12
 
 @dataclass(frozen=True)
 class UnitingEquations:
-    """Scalar equations ``direction . du_node - sum_a coefficients_a . du_a = -gap`` [UEM, 4.1 and 6.1].
+    """Scalar equations ``direction . du_node - sum_a coefficients_a . du_a = -gap`` [UEM, 4.1 and 6.1]."""
 
-    Attributes:
-        node: local number of the owned node whose displacement is eliminated ``(m,)``.
-        direction: vectors ``(m, block)``, of unit length if a contactor follows its target.
-        gap: lengths ``(m,)``.
-        active: mask of active equations ``(m,)``; inactive ones only keep their entries in the sparsity of P, so that contactors can
-            be activated and released without new symbolic factorisations.
-        row: the equation that each term belongs to ``(k,)``.
-        followed: global block number of the node that the term follows ``(k,)``.
-        coefficients: of its displacement ``(k, block)``.
-    """
-
-    node: npt.NDArray[np.integer]
-    direction: Array
-    gap: Array
+    node: npt.NDArray[np.integer]  # local number of the owned node whose displacement is eliminated ``(m,)``
+    direction: Array  # vectors ``(m, block)``, of unit length if a contactor follows its target
+    gap: Array  # lengths ``(m,)``
+    #: mask of active equations ``(m,)``; inactive ones only keep their entries in the sparsity of P, so that contactors can
+    #: be activated and released without new symbolic factorisations.
     active: Bools
-    row: Ints
-    followed: Ints
-    coefficients: Array
+    row: Ints  # the equation that each term belongs to ``(k,)``
+    followed: Ints  # global block number of the node that the term follows ``(k,)``
+    coefficients: Array  # of its displacement ``(k, block)``
 
     def __len__(self) -> int:
         return len(self.node)

@@ -99,15 +99,10 @@ def solves_with_schur_complement(comm: MPI.Comm) -> bool:
 
 
 class Cost(NamedTuple):
-    """Cost of a factorisation.
+    """Cost of a factorisation."""
 
-    Attributes:
-        flops: floating-point operations.
-        entries: of the factors.
-    """
-
-    flops: float
-    entries: float
+    flops: float  # floating-point operations
+    entries: float  # of the factors
 
     @classmethod
     def counted(cls, flops: float, entries: int) -> Cost:

@@ -33,8 +33,7 @@ DEPENDENT = 2e-3
 #: Parts of a unit displacement below it are rounding.
 #: [derived; directions of length one; test_restriction.py::test_rings_that_fade]
 FADED = np.finfo(float).eps
-#: Closed equations of a ring are found for so many nodes that they follow at a time.
-#: [bound; number of nodes; -]
+#: Closed equations of a ring are found for so many nodes that they follow at a time. [bound; number of nodes; -]
 NODES_TOGETHER = 256
 
 

@@ -28,19 +28,12 @@ Value: TypeAlias = "npt.ArrayLike | fem.Constant | Callable[[float], Any]"
 
 @dataclass(frozen=True)
 class GivenRows:
-    """Equations ``sum_k c_k . u_k = b`` of this rank, each with its terms.
+    """Equations ``sum_k c_k . u_k = b`` of this rank, each with its terms."""
 
-    Attributes:
-        value: number of the value b among the values of the declaration ``(m,)``.
-        row: the equation that each term belongs to ``(k,)``.
-        node: global node of each term ``(k,)``; the first node of an equation is its position in messages.
-        coefficients: c of each term ``(k, gdim)``.
-    """
-
-    value: Ints
-    row: Ints
-    node: Ints
-    coefficients: Array
+    value: Ints  # number of the value b among the values of the declaration ``(m,)``
+    row: Ints  # the equation that each term belongs to ``(k,)``
+    node: Ints  # global node of each term ``(k,)``; the first node of an equation is its position in messages
+    coefficients: Array  # c of each term ``(k, gdim)``
 
     def __len__(self) -> int:
         return len(self.value)

@@ -33,25 +33,15 @@ from uem_dolfinx.parallel import gathered, reduced
 
 @dataclass(frozen=True)
 class Solved:
-    """Independent rows whose eliminated nodes this rank owns.
+    """Independent rows whose eliminated nodes this rank owns."""
 
-    Attributes:
-        pivot: eliminated component, as ``global node * gdim + component`` ``(m,)``.
-        row: the row of each entry of R except the pivots ``(k,)``.
-        column: component of each entry, numbered as ``pivot`` ``(k,)``.
-        entry: of R ``(k,)``.
-        weight_row: the row of each entry of T ``(l,)``.
-        weight_value: number of the value b that it multiplies ``(l,)``.
-        weight: of T ``(l,)``.
-    """
-
-    pivot: Ints
-    row: Ints
-    column: Ints
-    entry: Array
-    weight_row: Ints
-    weight_value: Ints
-    weight: Array
+    pivot: Ints  # eliminated component, as ``global node * gdim + component`` ``(m,)``
+    row: Ints  # the row of each entry of R except the pivots ``(k,)``
+    column: Ints  # component of each entry, numbered as ``pivot`` ``(k,)``
+    entry: Array  # of R ``(k,)``
+    weight_row: Ints  # the row of each entry of T ``(l,)``
+    weight_value: Ints  # number of the value b that it multiplies ``(l,)``
+    weight: Array  # of T ``(l,)``
 
 
 def sizes(config: Configuration, rows: GivenRows, free: Bools) -> Array:
@@ -190,25 +180,15 @@ def _owned(config: Configuration, made: list[tuple[Ints, Array, Ints, Array, Int
 
 @dataclass(frozen=True)
 class Basis:
-    """Components q that sets keep, the same on all ranks.
+    """Components q that sets keep, the same on all ranks."""
 
-    Attributes:
-        node: global nodes ``(k,)``.
-        component: of each ``(k,)``.
-        part: set of each ``(k,)``.
-        X: positions of the nodes in the reference configuration ``(k, gdim)``.
-        kept: rows of C that are independent of those before them ``(n_kept,)``.
-        least: smallest singular value of their rows and the rows of the prescribed motion, when they were chosen.
-        halo: fetches values from the owners.
-    """
-
-    node: Ints
-    component: Ints
-    part: Ints
-    X: Array
-    kept: Ints
-    least: float
-    halo: Halo
+    node: Ints  # global nodes ``(k,)``
+    component: Ints  # of each ``(k,)``
+    part: Ints  # set of each ``(k,)``
+    X: Array  # positions of the nodes in the reference configuration ``(k, gdim)``
+    kept: Ints  # rows of C that are independent of those before them ``(n_kept,)``
+    least: float  # smallest singular value of their rows and the rows of the prescribed motion, when they were chosen
+    halo: Halo  # fetches values from the owners
 
     @cached_property
     def nodes(self) -> tuple[Ints, Ints]:

@@ -20,8 +20,7 @@ from uem_dolfinx.parallel import gathered, reduced
 #: A node is at a position if it is nearer than this part of the distance of the second nearest node.
 #: [convention; distance of the second node; test_places.py::test_how_near_a_node_must_be]
 NEAR = 1e-3
-#: Positions that differ by less are equal: nodes there cannot be distinguished.
-#: [bound; the model's size; -]
+#: Positions that differ by less are equal: nodes there cannot be distinguished. [bound; the model's size; -]
 COINCIDENT = 1e-9
 
 

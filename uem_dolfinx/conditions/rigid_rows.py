@@ -47,21 +47,13 @@ SPRUNG = 1e-12
 
 @dataclass(frozen=True)
 class Aim:
-    """What a linearisation aims at.
+    """What a linearisation aims at."""
 
-    Attributes:
-        at: placement of each set.
-        C: rows of the prescribed motions and, after them, of equations between parts and of joints ``(k, n_z)``.
-        lacking: their residuals ``(k,)``.
-        part: set of each prescribed component ``(n_prescribed,)``.
-        bends: second derivatives of the rows of equations and joints ``(k - n_prescribed, n_z, n_z)``.
-    """
-
-    at: list[Placement]
-    C: Array
-    lacking: Array
-    part: Ints
-    bends: Array
+    at: list[Placement]  # placement of each set
+    C: Array  # rows of the prescribed motions and, after them, of equations between parts and of joints ``(k, n_z)``
+    lacking: Array  # their residuals ``(k,)``
+    part: Ints  # set of each prescribed component ``(n_prescribed,)``
+    bends: Array  # second derivatives of the rows of equations and joints ``(k - n_prescribed, n_z, n_z)``
 
 
 class RigidRows:

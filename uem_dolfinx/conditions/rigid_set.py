@@ -43,15 +43,10 @@ def moments(arms: Array, forces: Array) -> Array:
 
 @dataclass(frozen=True)
 class Placement:
-    """Position and orientation of a set as one rigid body.
+    """Position and orientation of a set as one rigid body."""
 
-    Attributes:
-        motion: from the reference configuration to the present, about the middle of the set.
-        small: small rotation ``(n_turns,)`` instead of the motion's rotation; None for a finite rotation.
-    """
-
-    motion: Motion
-    small: Array | None = None
+    motion: Motion  # from the reference configuration to the present, about the middle of the set
+    small: Array | None = None  # small rotation ``(n_turns,)`` instead of the motion's rotation; None for a finite rotation
 
     def arms(self, X: Array) -> Array:
         """Present arms from the middle to points with reference positions ``X (n, gdim)``."""

@@ -13,8 +13,7 @@ from uem_dolfinx.decks.parts import Acting, Linear, Model, Value, Where, togethe
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.decks import Deck
 
-#: A local direction is a global one if its other components are smaller.
-#: [bound; 1; -]
+#: A local direction is a global one if its other components are smaller. [bound; 1; -]
 NO_COMPONENT = 1e-12
 
 

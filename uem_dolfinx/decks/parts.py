@@ -14,14 +14,12 @@ from uem_dolfinx.errors import InputError
 
 #: Kinds of steps that are taken, and whether they have temperatures among their unknowns.
 STEP_KINDS = {"STATIC": False, "COUPLED TEMPERATURE-DISPLACEMENT": True, "HEAT TRANSFER": True, "DYNAMIC": False}
-#: Number of the temperature among the degrees of freedom.
-#: [format; number; -]
+#: Number of the temperature among the degrees of freedom. [format; number; -]
 TEMPERATURE = 11
 #: Steps of time of heat grow by this factor, up to a tenth of the step's duration.
 #: [convention; length of the step of time before; test_deck_runs.py::test_heat_in_steps_of_time]
 LONGER = 1.5
-#: Steps that are longer by less than this part are equally long.
-#: [bound; length of the step; -]
+#: Steps that are longer by less than this part are equally long. [bound; length of the step; -]
 SAME_LENGTH = 1e-6
 #: Number of steps of time of the greatest length.
 #: [convention; duration of the step; test_deck_runs.py::test_heat_in_steps_of_time]
@@ -33,17 +31,11 @@ Where: TypeAlias = tuple[str, Any]
 
 @dataclass(frozen=True)
 class Course:
-    """A value that follows an amplitude: linear between its points, constant beyond them.
+    """A value that follows an amplitude: linear between its points, constant beyond them."""
 
-    Attributes:
-        value: at the amplitude 1.
-        points: times and amplitudes.
-        total: whether times are those since the start of the first step, not of its own.
-    """
-
-    value: float
-    points: tuple[tuple[float, float], ...]
-    total: bool = False
+    value: float  # at the amplitude 1
+    points: tuple[tuple[float, float], ...]  # times and amplitudes
+    total: bool = False  # whether times are those since the start of the first step, not of its own
 
     def at(self, time: float, total: float) -> float:
         """The value at a time of the step and in all."""
@@ -77,15 +69,10 @@ def together(one: Value, other: Value, where: Any) -> Value:
 
 @dataclass(frozen=True)
 class BodyLoad:
-    """A load on the mass of elements.
+    """A load on the mass of elements."""
 
-    Attributes:
-        label: ``"GRAV"`` along a direction, or ``"CENTRIF"`` away from an axis.
-        numbers: a point of the axis ``(3,)``, and its direction, or that of gravity, of length 1.
-    """
-
-    label: str
-    numbers: tuple[float, ...]
+    label: str  # ``"GRAV"`` along a direction, or ``"CENTRIF"`` away from an axis
+    numbers: tuple[float, ...]  # a point of the axis ``(3,)``, and its direction, or that of gravity, of length 1
 
     @staticmethod
     def of(label: str, numbers: list[float]) -> BodyLoad:
@@ -202,34 +189,24 @@ class Step:
 
 @dataclass
 class Model:
-    """All of a deck but its mesh; names of sets are in capitals.
-
-    Attributes:
-        sections: set of elements and material of each section.
-        thickness: of plane bodies.
-        equations: linear equations among nodes.
-        initial: temperatures at the start, by set or node.
-        velocities: at the start, by set or node, and degree of freedom.
-        rigid: set, position, and nodes of translation and rotation of each rigid body.
-        pretension: surface, reference node and axis of each section of a bolt.
-        modes: number of vibrations that are wanted after the last step; 0 for none.
-        left_out: what has no counterpart here, or is read otherwise than it stands.
-    """
+    """All of a deck but its mesh; names of sets are in capitals."""
 
     types: set[str] = field(default_factory=set)
     materials: dict[str, Material] = field(default_factory=dict)
     interactions: dict[str, Interaction] = field(default_factory=dict)
-    sections: list[tuple[str, str]] = field(default_factory=list)
-    thickness: float = 1.0
+    sections: list[tuple[str, str]] = field(default_factory=list)  # set of elements and material of each section
+    thickness: float = 1.0  # of plane bodies
     pairs: list[Pair] = field(default_factory=list)
-    equations: list[Linear] = field(default_factory=list)
-    initial: dict[str, float] = field(default_factory=dict)
-    velocities: dict[tuple[str, int], float] = field(default_factory=dict)
+    equations: list[Linear] = field(default_factory=list)  # linear equations among nodes
+    initial: dict[str, float] = field(default_factory=dict)  # temperatures at the start, by set or node
+    velocities: dict[tuple[str, int], float] = field(default_factory=dict)  # at the start, by set or node, and degree of freedom
+    #: set, position, and nodes of translation and rotation of each rigid body.
     rigid: list[tuple[str, list[float], int, int]] = field(default_factory=list)
+    #: surface, reference node and axis of each section of a bolt.
     pretension: list[tuple[str, str, list[float]]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
-    modes: int = 0
-    left_out: list[str] = field(default_factory=list)
+    modes: int = 0  # number of vibrations that are wanted after the last step; 0 for none
+    left_out: list[str] = field(default_factory=list)  # what has no counterpart here, or is read otherwise than it stands
 
     @property
     def references(self) -> set[int]:

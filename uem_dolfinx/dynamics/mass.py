@@ -75,11 +75,9 @@ MOMENTS_KEPT = 1e-10
 #: Smallest spread of a body in any direction that is used to scale coordinates.
 #: [convention; largest spread; test_thresholds_motion.py::test_moments_of_a_thin_body]
 THIN = 1e-4
-#: Largest number of steps of Newton's method for the masses.
-#: [bound; steps; -]
+#: Largest number of steps of Newton's method for the masses. [bound; steps; -]
 MOST_ITERATIONS = 60
-#: Largest number of halvings of such a step.
-#: [bound; halvings; -]
+#: Largest number of halvings of such a step. [bound; halvings; -]
 MOST_HALVINGS = 20
 
 

@@ -130,8 +130,7 @@ def _stiffness_per_area(config: Configuration, part: object, K: Array) -> float:
 #: Components with less mass than this part of the largest have no acceleration at the start.
 #: [convention; diagonal of P'MP; test_thresholds_motion.py::test_components_without_mass]
 MASSLESS = 1e-12
-#: Relative tolerance of the residual of the first acceleration.
-#: [bound; forces; -]
+#: Relative tolerance of the residual of the first acceleration. [bound; forces; -]
 ACCELERATED = 1e-13
 
 

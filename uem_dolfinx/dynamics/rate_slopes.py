@@ -28,14 +28,13 @@ class ByState:
 
     Attributes:
         u, v, a, w: by displacement, velocity, acceleration and mean velocity.
-        forces: by the inertia forces.
     """
 
     u: Array
     v: Array
     a: Array
     w: Array
-    forces: Array
+    forces: Array  # by the inertia forces
 
 
 class RateSlopes:

@@ -15,8 +15,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError
 
 #: Contacts may give the bodies this part of the energies at work in a step: of the largest kinetic energy and of what contact forces hold
-#: in the surfaces that they press.
-#: [convention; energies at work; test_thresholds_motion.py::test_energy_given]
+#: in the surfaces that they press. [convention; energies at work; test_thresholds_motion.py::test_energy_given]
 MOST_GIVEN = 2e-3
 #: Steps in which contacts give energy are cut down to this part of the nominal length, and then accepted with a warning.
 #: [convention; nominal length; test_thresholds_motion.py::test_energy_given]

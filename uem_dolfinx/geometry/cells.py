@@ -9,11 +9,9 @@ from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.errors import MeshError
 from uem_dolfinx.geometry.nodes import described
 
-#: A cell whose thickness is less than this is flat.
-#: [convention; size of the cell; test_cells.py::test_how_thin_a_cell_may_be]
+#: A cell whose thickness is less than this is flat. [convention; size of the cell; test_cells.py::test_how_thin_a_cell_may_be]
 FLAT_CELL = 1e-10
-#: Cells whose volumes are computed at a time, which bounds the memory and changes no result.
-#: [bound; number; -]
+#: Cells whose volumes are computed at a time, which bounds the memory and changes no result. [bound; number; -]
 VOLUMES_AT_ONCE = 20_000
 
 

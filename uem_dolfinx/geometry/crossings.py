@@ -26,8 +26,7 @@ from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
 from uem_dolfinx.geometry.sharp import sharp_edges
 from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
 
-#: Halvings that find a time to the last bit.
-#: [bound; halvings; -]
+#: Halvings that find a time to the last bit. [bound; halvings; -]
 HALVINGS = 53
 #: A point that leaves the plane of a facet by less than this part of the reach moves with the facet.
 #: [bound; the reach; test_crossings.py::test_points_that_ride_on_facets]
@@ -36,23 +35,14 @@ BY_ROUNDING = 1e-10
 
 @dataclass(frozen=True)
 class Crossings:
-    """Crossings of ``k`` simplices, in no order.
+    """Crossings of ``k`` simplices, in no order."""
 
-    Attributes:
-        point: index of the point ``(k,)``.
-        facet: index of the simplex, or number over all ranks of its facet ``(k,)``.
-        way: length of the point's path relative to the simplex ``(k,)``.
-        time: 0 at the start and 1 at the end of the path ``(k,)``.
-        inwards: whether it enters the body ``(k,)``, or leaves it.
-        normal: outward unit normals at the crossing ``(k, gdim)``.
-    """
-
-    point: Ints
-    facet: Ints
-    way: Array
-    time: Array
-    inwards: Bools
-    normal: Array
+    point: Ints  # index of the point ``(k,)``
+    facet: Ints  # index of the simplex, or number over all ranks of its facet ``(k,)``
+    way: Array  # length of the point's path relative to the simplex ``(k,)``
+    time: Array  # 0 at the start and 1 at the end of the path ``(k,)``
+    inwards: Bools  # whether it enters the body ``(k,)``, or leaves it
+    normal: Array  # outward unit normals at the crossing ``(k, gdim)``
 
 
 def find_crossings(
@@ -252,15 +242,10 @@ DEEP = 0.02
 
 
 class Crossing(NamedTuple):
-    """The deepest crossing of edges.
+    """The deepest crossing of edges."""
 
-    Attributes:
-        depth: a length.
-        place: middle of the crossing ``(3,)``.
-    """
-
-    depth: float
-    place: Array
+    depth: float  # a length
+    place: Array  # middle of the crossing ``(3,)``
 
 
 class SharpEdges:

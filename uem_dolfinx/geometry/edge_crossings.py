@@ -137,51 +137,28 @@ class SharpLines:
 
 
 class Opposite(NamedTuple):
-    """Crossings at contactor nodes; one row for each.
+    """Crossings at contactor nodes; one row for each."""
 
-    Attributes:
-        node: global number of the contactor ``(k,)``.
-        own: its number among the nodes of its line ``(k,)``.
-        leads: whether it has the equation of the crossing; otherwise another node of the line has it ``(k,)``.
-        ridges: whether no facet at either line touches near the crossing ``(k,)``.
-        s: coordinate on its line ``(k,)``.
-        t: coordinate on the opposite line ``(k,)``.
-        x: positions of its line's nodes ``(k, 4, 3)``.
-        y: positions of the opposite line's nodes ``(k, 4, 3)``.
-        cubic: of its line ``(k, 4, 4)``.
-        opposite: of the opposite line ``(k, 4, 4)``.
-        normal: from the opposite line to its own ``(k, 3)``.
-        nodes: global numbers of its line's nodes ``(k, 4)``.
-        followed: global numbers of the opposite line's nodes ``(k, 4)``.
-        ends: whether the lines end at the pieces' nodes ``(k, 4)``, first its own.
-        facet: number over all ranks of a facet at the opposite line ``(k,)``.
-        xi: coordinates in this facet ``(k, 2)``.
-        facet_nodes: global numbers of its nodes ``(k, nn)``.
-        facet_x: their positions ``(k, nn, 3)``.
-        key: of both pieces, independent of the partition ``(k, 2)``.
-        told: visibility keys of both ``(k, 2 m)``.
-    """
-
-    node: Ints
-    own: Ints
-    leads: Bools
-    ridges: Bools
-    s: Array
-    t: Array
-    x: Array
-    y: Array
-    cubic: Array
-    opposite: Array
-    normal: Array
-    nodes: Ints
-    followed: Ints
-    ends: Bools
-    facet: Ints
-    xi: Array
-    facet_nodes: Ints
-    facet_x: Array
-    key: Ints
-    told: Ints
+    node: Ints  # global number of the contactor ``(k,)``
+    own: Ints  # its number among the nodes of its line ``(k,)``
+    leads: Bools  # whether it has the equation of the crossing; otherwise another node of the line has it ``(k,)``
+    ridges: Bools  # whether no facet at either line touches near the crossing ``(k,)``
+    s: Array  # coordinate on its line ``(k,)``
+    t: Array  # coordinate on the opposite line ``(k,)``
+    x: Array  # positions of its line's nodes ``(k, 4, 3)``
+    y: Array  # positions of the opposite line's nodes ``(k, 4, 3)``
+    cubic: Array  # of its line ``(k, 4, 4)``
+    opposite: Array  # of the opposite line ``(k, 4, 4)``
+    normal: Array  # from the opposite line to its own ``(k, 3)``
+    nodes: Ints  # global numbers of its line's nodes ``(k, 4)``
+    followed: Ints  # global numbers of the opposite line's nodes ``(k, 4)``
+    ends: Bools  # whether the lines end at the pieces' nodes ``(k, 4)``, first its own
+    facet: Ints  # number over all ranks of a facet at the opposite line ``(k,)``
+    xi: Array  # coordinates in this facet ``(k, 2)``
+    facet_nodes: Ints  # global numbers of its nodes ``(k, nn)``
+    facet_x: Array  # their positions ``(k, nn, 3)``
+    key: Ints  # of both pieces, independent of the partition ``(k, 2)``
+    told: Ints  # visibility keys of both ``(k, 2 m)``
 
     @property
     def gaps(self) -> EdgeGaps:

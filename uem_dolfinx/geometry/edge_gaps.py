@@ -15,14 +15,11 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 
-#: Newton's iterations for the closest points of two lines.
-#: [bound; iterations; -]
+#: Newton's iterations for the closest points of two lines. [bound; iterations; -]
 LINE_ITERATIONS = 12
-#: They end with steps below this one.
-#: [bound; reference coordinates; -]
+#: They end with steps below this one. [bound; reference coordinates; -]
 LINE_ROUNDING = 1e-15
-#: Steps of these iterations are shorter.
-#: [bound; reference coordinates; -]
+#: Steps of these iterations are shorter. [bound; reference coordinates; -]
 LONGEST_STEP = 1.0
 
 
@@ -109,23 +106,14 @@ def _step(away: Array, a: Array, b: Array, da: Array, db: Array) -> tuple[Array,
 
 @dataclass(frozen=True)
 class EdgeGaps:
-    """Gaps between pairs of lines at given points.
+    """Gaps between pairs of lines at given points."""
 
-    Attributes:
-        cubics: of both lines, see ``cubics`` ``(k, 4, 4)``.
-        s: coordinates on the first lines ``(k,)``.
-        t: coordinates on the second lines.
-        x: nodes of the first lines ``(k, 4, 3)``.
-        y: nodes of the second lines.
-        normal: unit vectors from the second lines to the first ``(k, 3)``, perpendicular to both.
-    """
-
-    cubics: tuple[Array, Array]
-    s: Array
-    t: Array
-    x: Array
-    y: Array
-    normal: Array
+    cubics: tuple[Array, Array]  # of both lines, see ``cubics`` ``(k, 4, 4)``
+    s: Array  # coordinates on the first lines ``(k,)``
+    t: Array  # coordinates on the second lines
+    x: Array  # nodes of the first lines ``(k, 4, 3)``
+    y: Array  # nodes of the second lines
+    normal: Array  # unit vectors from the second lines to the first ``(k, 3)``, perpendicular to both
 
     @classmethod
     def between(cls, cubics: tuple[Array, Array], x: Array, y: Array, outward: Array) -> EdgeGaps:

@@ -25,20 +25,14 @@ FACET_OF = {"triangle": "interval", "quadrilateral": "interval", "tetrahedron": 
 
 @dataclass(frozen=True)
 class FacetData:
-    """Target facets of one rank in the current configuration.
+    """Target facets of one rank in the current configuration."""
 
-    Attributes:
-        x: current positions of their nodes ``(m, nn, gdim)``.
-        nodes: global block numbers of the nodes ``(m, nn)``.
-        nodal_normals: averaged outward unit normals there ``(m, nn, gdim)``.
-        corner_normals: sums of the outward unit normals of the facets around each corner, weighted with the angle of the facet
-            there ``(m, n_corners, gdim)``. If the closest point is a corner, they decide whether the point is outside (Baerentzen
-            and Aanaes, 2005, doi:10.1109/TVCG.2005.49). None if they have not been computed.
-    """
-
-    x: Array
-    nodes: Ints
-    nodal_normals: Array
+    x: Array  # current positions of their nodes ``(m, nn, gdim)``
+    nodes: Ints  # global block numbers of the nodes ``(m, nn)``
+    nodal_normals: Array  # averaged outward unit normals there ``(m, nn, gdim)``
+    #: sums of the outward unit normals of the facets around each corner, weighted with the angle of the facet
+    #: there ``(m, n_corners, gdim)``. If the closest point is a corner, they decide whether the point is outside (Baerentzen
+    #: and Aanaes, 2005, doi:10.1109/TVCG.2005.49). None if they have not been computed.
     corner_normals: Array | None = None
 
 
@@ -192,19 +186,12 @@ class TargetFacets:
 
 
 class FacetNodes(NamedTuple):
-    """Nodes of the facets of a surface behind which this rank owns the cell.
+    """Nodes of the facets of a surface behind which this rank owns the cell."""
 
-    Attributes:
-        own: whether the cell at each side of each facet is owned by this rank, in the order of sides ``(n,)``.
-        cells: cells behind the facets ``(m,)``.
-        sides: local number of each facet in its cell ``(m,)``.
-        dofs: local nodes, in the numbering of the facet's own element ``(m, nn)``.
-    """
-
-    own: Bools
-    cells: Indices
-    sides: Indices
-    dofs: Indices
+    own: Bools  # whether the cell at each side of each facet is owned by this rank, in the order of sides ``(n,)``
+    cells: Indices  # cells behind the facets ``(m,)``
+    sides: Indices  # local number of each facet in its cell ``(m,)``
+    dofs: Indices  # local nodes, in the numbering of the facet's own element ``(m, nn)``
 
 
 def nodes_of_facets(config: Configuration, tag: Tag) -> FacetNodes:

@@ -13,21 +13,14 @@ from uem_dolfinx.arrays import Array, Ints
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of cells, with nodes in VTK's order: vertices, edge nodes, nodes of quadrilaterals, and one in the middle.
+    """A kind of cells, with nodes in VTK's order: vertices, edge nodes, nodes of quadrilaterals, and one in the middle."""
 
-    Attributes:
-        vertices: number of vertices.
-        edges: pairs of vertices.
-        faces: vertices of the sides of 3D cells, in order around each, seen from outside; empty in 2D, where sides are edges.
-        quads: vertices of quadrilaterals with a middle node in the complete cell.
-        centre: whether the complete cell has a node in its middle.
-    """
-
-    vertices: int
-    edges: Sequence[tuple[int, ...]]
+    vertices: int  # number of vertices
+    edges: Sequence[tuple[int, ...]]  # pairs of vertices
+    #: vertices of the sides of 3D cells, in order around each, seen from outside; empty in 2D, where sides are edges.
     faces: Sequence[tuple[int, ...]] = ()
-    quads: Sequence[tuple[int, ...]] = ()
-    centre: bool = False
+    quads: Sequence[tuple[int, ...]] = ()  # vertices of quadrilaterals with a middle node in the complete cell
+    centre: bool = False  # whether the complete cell has a node in its middle
 
     @property
     def dim(self) -> int:
@@ -76,17 +69,11 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Block:
-    """Cells of one kind.
+    """Cells of one kind."""
 
-    Attributes:
-        type: meshio's name, such as ``"hexahedron20"``.
-        data: nodes of each cell, in VTK's order ``(n, k)``.
-        numbers: of the cells in the file ``(n,)``, if it has any.
-    """
-
-    type: str
-    data: Ints
-    numbers: Ints | None = None
+    type: str  # meshio's name, such as ``"hexahedron20"``
+    data: Ints  # nodes of each cell, in VTK's order ``(n, k)``
+    numbers: Ints | None = None  # of the cells in the file ``(n,)``, if it has any
 
     @property
     def base(self) -> str:
@@ -102,25 +89,16 @@ class Block:
 
 @dataclass(frozen=True)
 class Found:
-    """A mesh as stored in a file.
+    """A mesh as stored in a file."""
 
-    Attributes:
-        points: all nodes, including nodes without cell ``(n, 2 or 3)``.
-        cells: blocks of cells of any dimension.
-        cell_sets: members of each set in every block, by name.
-        point_sets: nodes of each set, by name.
-        sides: vertices of the facets of each surface, one array for each number of vertices, by name.
-        cell_data: integers of cells, in every block, by name.
-        as_points: names of sets of nodes that are points, even if they have all nodes of facets.
-    """
-
-    points: Array
-    cells: list[Block]
-    cell_sets: dict[str, list[Ints]] = field(default_factory=dict)
-    point_sets: dict[str, Ints] = field(default_factory=dict)
+    points: Array  # all nodes, including nodes without cell ``(n, 2 or 3)``
+    cells: list[Block]  # blocks of cells of any dimension
+    cell_sets: dict[str, list[Ints]] = field(default_factory=dict)  # members of each set in every block, by name
+    point_sets: dict[str, Ints] = field(default_factory=dict)  # nodes of each set, by name
+    #: vertices of the facets of each surface, one array for each number of vertices, by name.
     sides: dict[str, list[Ints]] = field(default_factory=dict)
-    cell_data: dict[str, list[Ints]] = field(default_factory=dict)
-    as_points: frozenset[str] = frozenset()
+    cell_data: dict[str, list[Ints]] = field(default_factory=dict)  # integers of cells, in every block, by name
+    as_points: frozenset[str] = frozenset()  # names of sets of nodes that are points, even if they have all nodes of facets
 
     @property
     def dim(self) -> int:

@@ -19,8 +19,7 @@ FILLED_BY = {
 #: Sizes grow by at most this part of the way from one cell to the next, so that cells have good shapes.
 #: [convention; size over distance; test_mesh_sizes.py::test_sizes_grow_slowly]
 GROWTH = 0.5
-#: Digits of sizes, relative, by which these do not depend on the number of ranks.
-#: [bound; digits; test_adapt.py::test_partitions]
+#: Digits of sizes, relative, by which these do not depend on the number of ranks. [bound; digits; test_adapt.py::test_partitions]
 DIGITS = 6
 #: Options of Gmsh by which other sizes would count, and values by which they do not.
 OTHERS = {

@@ -49,51 +49,29 @@ _orders = count()
 
 @dataclass(frozen=True)
 class Listing:
-    """Pairs of nodes and facets, each stored on the rank of the facet.
+    """Pairs of nodes and facets, each stored on the rank of the facet."""
 
-    Attributes:
-        exchange: with the ranks that have facets for this rank's nodes; its rows are indices of nodes.
-        node: index among the nodes received ``(k,)``.
-        facet: number on this rank ``(k,)``.
-        cosine: least cosine between the facet's normal and the normals around the node, when it was listed ``(k,)``.
-        opened: sides of these facets beyond which no facet is listed for the node ``(k, n_sides)``.
-        empty: whether no rank has a pair.
-    """
-
-    exchange: Exchange
-    node: Ints
-    facet: Ints
-    cosine: Array
-    opened: Bools
-    empty: bool
+    exchange: Exchange  # with the ranks that have facets for this rank's nodes; its rows are indices of nodes
+    node: Ints  # index among the nodes received ``(k,)``
+    facet: Ints  # number on this rank ``(k,)``
+    cosine: Array  # least cosine between the facet's normal and the normals around the node, when it was listed ``(k,)``
+    opened: Bools  # sides of these facets beyond which no facet is listed for the node ``(k, n_sides)``
+    empty: bool  # whether no rank has a pair
 
 
 class Asking(NamedTuple):
-    """Data of nodes that the ranks of facets need.
+    """Data of nodes that the ranks of facets need."""
 
-    Attributes:
-        points: current positions ``(n, gdim)``.
-        committed: positions at the end of the last accepted step ``(n, gdim)``.
-        drawn: positions in the reference configuration ``(n, gdim)``.
-        reach: search distance, a length ``(n,)``.
-        body: body of each node ``(n,)``.
-        node: global number ``(n,)``.
-        corner: whether it lies on a sharp convex edge ``(n,)``.
-        cones: normals of the facets around them, now and in the reference configuration ``(n, c, 2, gdim)``.
-        sides: whether they are in sets of facets that never touch each other ``(n, s)``.
-        held: facets that hold them ``(n, n_lists)``.
-    """
-
-    points: Array
-    committed: Array
-    drawn: Array
-    reach: Array
-    body: Ints
-    node: Ints
-    corner: Bools
-    cones: Array
-    sides: Bools
-    held: Ints
+    points: Array  # current positions ``(n, gdim)``
+    committed: Array  # positions at the end of the last accepted step ``(n, gdim)``
+    drawn: Array  # positions in the reference configuration ``(n, gdim)``
+    reach: Array  # search distance, a length ``(n,)``
+    body: Ints  # body of each node ``(n,)``
+    node: Ints  # global number ``(n,)``
+    corner: Bools  # whether it lies on a sharp convex edge ``(n,)``
+    cones: Array  # normals of the facets around them, now and in the reference configuration ``(n, c, 2, gdim)``
+    sides: Bools  # whether they are in sets of facets that never touch each other ``(n, s)``
+    held: Ints  # facets that hold them ``(n, n_lists)``
 
 
 #: Attributes of ``Neighbours`` that change when bodies are placed; a repeated step restores them.

@@ -28,19 +28,12 @@ STILL_FACING = 0.2
 
 @dataclass(frozen=True)
 class Opposite:
-    """Pairs of facets, ordered by contactor facet and then by the key of the target facet.
+    """Pairs of facets, ordered by contactor facet and then by the key of the target facet."""
 
-    Attributes:
-        facet: number of the contactor facet among the given ones ``(k,)``, ascending.
-        x: nodes of the target facet ``(k, nt, gdim)``.
-        nodes: their global block numbers ``(k, nt)``.
-        key: of the target facet, independent of the partition ``(k,)``.
-    """
-
-    facet: Ints
-    x: Array
-    nodes: Ints
-    key: Ints
+    facet: Ints  # number of the contactor facet among the given ones ``(k,)``, ascending
+    x: Array  # nodes of the target facet ``(k, nt, gdim)``
+    nodes: Ints  # their global block numbers ``(k, nt)``
+    key: Ints  # of the target facet, independent of the partition ``(k,)``
 
 
 @timed("search")

@@ -17,8 +17,7 @@ from uem_dolfinx import forms
 from uem_dolfinx.arrays import Array, Ints, cross_products
 from uem_dolfinx.geometry.shapes import FacetShape
 
-#: Smaller segments are rounding of sides that coincide.
-#: [convention; part of the contactor facet; test_overlaps.py::test_slivers]
+#: Smaller segments are rounding of sides that coincide. [convention; part of the contactor facet; test_overlaps.py::test_slivers]
 SLIVER = 1e-12
 #: Facets whose maps differ less from affine maps are integrated like affine facets, to 1e-12.
 #: [convention; part of the largest facet; test_overlaps.py::test_facets_that_are_affine]
@@ -26,8 +25,7 @@ STRAIGHT = 0.01
 #: Increase of the degree of quadrature where maps differ more, and products of shape functions are no polynomials.
 #: [convention; degree; test_overlaps.py::test_products_that_are_no_polynomials]
 BENT = 8
-#: Newton iterations for the position of a point in the plane of a facet whose map is not affine.
-#: [bound; iterations; -]
+#: Newton iterations for the position of a point in the plane of a facet whose map is not affine. [bound; iterations; -]
 IN_MEAN_PLANE = 12
 
 
@@ -37,17 +35,11 @@ Facets: TypeAlias = tuple[FacetShape, Array]
 
 @dataclass(frozen=True)
 class Planes:
-    """Mean planes of facets.
+    """Mean planes of facets."""
 
-    Attributes:
-        origin: a corner ``(m, gdim)``.
-        axes: orthonormal: axes in the plane, then the outward normal ``(m, gdim, gdim)``.
-        size: length or area of the facets projected into the planes ``(m,)``.
-    """
-
-    origin: Array
-    axes: Array
-    size: Array
+    origin: Array  # a corner ``(m, gdim)``
+    axes: Array  # orthonormal: axes in the plane, then the outward normal ``(m, gdim, gdim)``
+    size: Array  # length or area of the facets projected into the planes ``(m,)``
 
     @classmethod
     def of(cls, shape: FacetShape, x: Array, sign: Array) -> Planes:
@@ -84,21 +76,13 @@ class Planes:
 
 @dataclass(frozen=True)
 class Segments:
-    """Quadrature points of the segments of pairs of facets, in the order of the pairs.
+    """Quadrature points of the segments of pairs of facets, in the order of the pairs."""
 
-    Attributes:
-        pair: number of the pair ``(q,)``, ascending.
-        xi: reference coordinates on the contactor facet ``(q, fdim)``.
-        eta: on the target facet ``(q, fdim)``.
-        weight: of the quadrature in the mean plane, a length or an area ``(q,)``.
-        gap: distance from the contactor to the target along the contactor's normal ``(q,)``.
-    """
-
-    pair: Ints
-    xi: Array
-    eta: Array
-    weight: Array
-    gap: Array
+    pair: Ints  # number of the pair ``(q,)``, ascending
+    xi: Array  # reference coordinates on the contactor facet ``(q, fdim)``
+    eta: Array  # on the target facet ``(q, fdim)``
+    weight: Array  # of the quadrature in the mean plane, a length or an area ``(q,)``
+    gap: Array  # distance from the contactor to the target along the contactor's normal ``(q,)``
 
 
 def quadrature(shape: FacetShape, straight: bool) -> tuple[Array, Array]:

@@ -15,8 +15,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
 #: [bound; cosine, and length of the facet; test_offset_edges.py::test_points_on_their_feet]
 ALONG_NORMAL = 1e-12
 #: Facets go on below points that are behind an edge and beside them by less than this part of their depth; at sharper edges, which hold
-#: points by both facets, they do not.
-#: [convention; slope; test_behind_edges.py::test_shallow_edges]
+#: points by both facets, they do not. [convention; slope; test_behind_edges.py::test_shallow_edges]
 SHALLOW = 0.25
 #: Offsets of less than this part of the facet do not round a convex edge: Newton's steps are longer than such an arc.
 #: [heuristic; length of the facet; test_offset_edges.py::test_what_rounds_an_edge]
@@ -142,17 +141,7 @@ class Target(Protocol):
 
 @dataclass(frozen=True)
 class FacetProjection:
-    """Projection onto meshed facets; fields as in ``Projection``, and the facet's geometry at the closest point.
-
-    Attributes:
-        xi: reference coordinates of the closest point ``(n, fdim)``.
-        foot: closest points ``(n, gdim)``.
-        averaged: interpolated nodal normals ``(n, gdim)``.
-        x: positions of the facet's nodes ``(n, nn, gdim)``.
-        dN: derivatives of the weights ``(n, nn, fdim)``.
-        ddN: second derivatives ``(n, nn, fdim, fdim)``.
-        shape_operator: derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero for the facet's own normal.
-    """
+    """Projection onto meshed facets; fields as in ``Projection``, and the facet's geometry at the closest point."""
 
     gap: Array
     normal: Array
@@ -161,13 +150,13 @@ class FacetProjection:
     facet: Ints
     beyond: Array
     from_end: Array
-    xi: Array
-    foot: Array
-    averaged: Array
-    x: Array
-    dN: Array
-    ddN: Array
-    shape_operator: Array
+    xi: Array  # reference coordinates of the closest point ``(n, fdim)``
+    foot: Array  # closest points ``(n, gdim)``
+    averaged: Array  # interpolated nodal normals ``(n, gdim)``
+    x: Array  # positions of the facet's nodes ``(n, nn, gdim)``
+    dN: Array  # derivatives of the weights ``(n, nn, fdim)``
+    ddN: Array  # second derivatives ``(n, nn, fdim, fdim)``
+    shape_operator: Array  # derivative of an averaged normal along the facet ``(n, fdim, gdim)``; zero for the facet's own normal
     offset: Array | None = None
 
     @property

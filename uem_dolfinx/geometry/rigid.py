@@ -54,13 +54,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class RigidProjection:
-    """Projection onto a rigid surface; fields as in ``projection.Projection``, without nodes.
-
-    Attributes:
-        points: projected points ``(n, gdim)``.
-        shape_operator: derivative of the normal in the tangent plane ``(n, gdim, gdim)``.
-        motion: of the surface at the projection; None at its reference position.
-    """
+    """Projection onto a rigid surface; fields as in ``projection.Projection``, without nodes."""
 
     gap: Array
     normal: Array
@@ -68,9 +62,9 @@ class RigidProjection:
     weights: Array
     facet: Ints
     beyond: Array
-    points: Array
-    shape_operator: Array
-    motion: Motion | None = None
+    points: Array  # projected points ``(n, gdim)``
+    shape_operator: Array  # derivative of the normal in the tangent plane ``(n, gdim, gdim)``
+    motion: Motion | None = None  # of the surface at the projection; None at its reference position
     offset: Array | None = None
 
     @property

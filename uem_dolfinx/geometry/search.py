@@ -31,33 +31,20 @@ SIDEWAYS = 0.1
 
 
 class Feet(NamedTuple):
-    """Closest points on facets: the data sent from the ranks of facets to the ranks of points.
+    """Closest points on facets: the data sent from the ranks of facets to the ranks of points."""
 
-    Attributes:
-        facet: number over all ranks ``(n,)``.
-        key: of the facet, independent of the partition ``(n,)``.
-        xi: reference coordinates ``(n, fdim)``.
-        x: current positions of the facet's nodes ``(n, nn, gdim)``.
-        nodes: their global numbers ``(n, nn)``.
-        nodal_normals: averaged normals there ``(n, nn, gdim)``.
-        sign: factor that makes the parametrisation's normal point outwards ``(n,)``.
-        open_sides: sides that bound the surface ``(n, n_sides)``.
-        open_nodes: nodes on such sides ``(n, nn)``.
-        facing: height of the point in front of or behind the facet, see ``_facing`` ``(n,)``; zero for facets given by number.
-        cosine: least cosine between the facet's normal and the normals around the point if known, else 0 ``(n,)``.
-    """
-
-    facet: Ints
-    key: Ints
-    xi: Array
-    x: Array
-    nodes: Ints
-    nodal_normals: Array
-    sign: Array
-    open_sides: Bools
-    open_nodes: Bools
+    facet: Ints  # number over all ranks ``(n,)``
+    key: Ints  # of the facet, independent of the partition ``(n,)``
+    xi: Array  # reference coordinates ``(n, fdim)``
+    x: Array  # current positions of the facet's nodes ``(n, nn, gdim)``
+    nodes: Ints  # their global numbers ``(n, nn)``
+    nodal_normals: Array  # averaged normals there ``(n, nn, gdim)``
+    sign: Array  # factor that makes the parametrisation's normal point outwards ``(n,)``
+    open_sides: Bools  # sides that bound the surface ``(n, n_sides)``
+    open_nodes: Bools  # nodes on such sides ``(n, nn)``
+    #: height of the point in front of or behind the facet, see ``_facing`` ``(n,)``; zero for facets given by number.
     facing: Array
-    cosine: Array
+    cosine: Array  # least cosine between the facet's normal and the normals around the point if known, else 0 ``(n,)``
 
 
 class MeshTarget:

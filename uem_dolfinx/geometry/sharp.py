@@ -21,17 +21,11 @@ CORNER = 0.955
 
 
 class Edges(NamedTuple):
-    """Neighbours and sharpness at each side of this rank's facets, ``(m, n_sides)`` each.
+    """Neighbours and sharpness at each side of this rank's facets, ``(m, n_sides)`` each."""
 
-    Attributes:
-        across: number over all ranks of the facet that shares the side, -1 for no or several facets.
-        sharp: sides at which the normals of both facets differ by more than the angle.
-        convex: sharp sides that are convex.
-    """
-
-    across: Ints
-    sharp: Bools
-    convex: Bools
+    across: Ints  # number over all ranks of the facet that shares the side, -1 for no or several facets
+    sharp: Bools  # sides at which the normals of both facets differ by more than the angle
+    convex: Bools  # sharp sides that are convex
 
 
 def sharp_edges(facets: TargetFacets, cosine: float = SHARP_EDGE) -> Edges:

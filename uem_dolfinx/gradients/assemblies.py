@@ -101,16 +101,11 @@ def by_section(section: Preloaded, parameter: str, n: int) -> tuple[Array, Array
 
 
 class Prescribed(NamedTuple):
-    """What equations, couplings and preloads of a problem prescribe in a step.
+    """What equations, couplings and preloads of a problem prescribe in a step."""
 
-    Attributes:
-        equations: values and ramps of users' equations.
-        couplings: values of functions of the load factor, by coupling.
-        sections: force of each preload, whether its opening is locked or prescribed, and the opening.
-    """
-
-    equations: list[Any]
-    couplings: list[dict[str, Any]]
+    equations: list[Any]  # values and ramps of users' equations
+    couplings: list[dict[str, Any]]  # values of functions of the load factor, by coupling
+    #: force of each preload, whether its opening is locked or prescribed, and the opening.
     sections: list[tuple[float, bool, bool, float]]
 
     @classmethod

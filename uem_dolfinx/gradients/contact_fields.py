@@ -111,19 +111,13 @@ def _entries(at: Any, m: fem.Function, contact: Contact) -> Ints:
 
 
 class PressureWeights(NamedTuple):
-    """Derivative of ``sum w_i p_i``.
+    """Derivative of ``sum w_i p_i``."""
 
-    Attributes:
-        multipliers: by the multipliers of the equations ``(m,)``.
-        areas: functional whose derivatives by displacement and shape are the derivatives through the areas; None for points.
-        now: by the present positions of the owned nodes ``(n_owned, gdim)``, at fixed forces and ``areas``.
-        drawn: by the reference positions of the owned nodes ``(n_owned, gdim)``, at fixed present positions.
-    """
-
-    multipliers: Array
+    multipliers: Array  # by the multipliers of the equations ``(m,)``
+    #: functional whose derivatives by displacement and shape are the derivatives through the areas; None for points.
     areas: ufl.Form | None
-    now: Array
-    drawn: Array
+    now: Array  # by the present positions of the owned nodes ``(n_owned, gdim)``, at fixed forces and ``areas``
+    drawn: Array  # by the reference positions of the owned nodes ``(n_owned, gdim)``, at fixed present positions
 
 
 class PressureSlopes:

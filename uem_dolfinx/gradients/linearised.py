@@ -77,17 +77,11 @@ MORE_THAN_LEFT = 1e3
 
 
 class Motion(NamedTuple):
-    """Changes along a direction of controls.
+    """Changes along a direction of controls."""
 
-    Attributes:
-        du: change of the displacement, and of all other fields.
-        shape: change of the positions of the nodes in the reference configuration.
-        reactions: change of the forces of contacts and Dirichlet conditions on the bodies.
-    """
-
-    du: fem.Function
-    shape: fem.Function
-    reactions: PETSc.Vec
+    du: fem.Function  # change of the displacement, and of all other fields
+    shape: fem.Function  # change of the positions of the nodes in the reference configuration
+    reactions: PETSc.Vec  # change of the forces of contacts and Dirichlet conditions on the bodies
 
 
 class Linearised:

@@ -20,33 +20,19 @@ from uem_dolfinx.solve.memory import Memory
 
 @dataclass(frozen=True)
 class Record:
-    """One committed step: a value.
+    """One committed step: a value."""
 
-    Attributes:
-        before: initial state of the step.
-        displacement: at its end ``(n_local incl. ghosts,)``.
-        states: of the interfaces in equilibrium, before their commit.
-        motions: of their rigid targets.
-        values: of Constants and Functions in the residual.
-        friction: of the interfaces' contactors ``(n,)`` each, or None.
-        offsets: of the contacts' contactors ``(n,)`` each, or None.
-        shares: of Constants and offsets, see ``solve.loading``, by their ids.
-        held: shares of Dirichlet values, ghosts included ``(n,)``, or one share of all.
-        dt: length of a time step; 0 in statics.
-        prescribed: what equations, couplings and preloads prescribe.
-    """
-
-    before: Memory
-    displacement: Array
-    states: list[PairState]
-    motions: list[Motion | None]
-    values: list[Array]
-    friction: list[Array | None]
-    offsets: list[Array | None]
-    shares: dict[int, float]
-    held: Array | float
-    dt: float
-    prescribed: Prescribed
+    before: Memory  # initial state of the step
+    displacement: Array  # at its end ``(n_local incl. ghosts,)``
+    states: list[PairState]  # of the interfaces in equilibrium, before their commit
+    motions: list[Motion | None]  # of their rigid targets
+    values: list[Array]  # of Constants and Functions in the residual
+    friction: list[Array | None]  # of the interfaces' contactors ``(n,)`` each, or None
+    offsets: list[Array | None]  # of the contacts' contactors ``(n,)`` each, or None
+    shares: dict[int, float]  # of Constants and offsets, see ``solve.loading``, by their ids
+    held: Array | float  # shares of Dirichlet values, ghosts included ``(n,)``, or one share of all
+    dt: float  # length of a time step; 0 in statics
+    prescribed: Prescribed  # what equations, couplings and preloads prescribe
 
 
 class Records:

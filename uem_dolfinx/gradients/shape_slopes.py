@@ -44,15 +44,11 @@ from uem_dolfinx.solve.united.rows import Rows
 
 @dataclass(frozen=True)
 class ShapeSlopes:
-    """Derivatives of some equations and of their forces by the positions of nodes.
-
-    Attributes:
-        rows: global nodes ``(m, k)`` and vectors ``(m, k, gdim)`` for the gaps ``(m,)``.
-        forces: global nodes ``(j, l)`` and blocks ``(j, l gdim, l gdim)`` for the residual, from columns to rows.
-    """
+    """Derivatives of some equations and of their forces by the positions of nodes."""
 
     config: Configuration
-    rows: tuple[Ints, Array]
+    rows: tuple[Ints, Array]  # global nodes ``(m, k)`` and vectors ``(m, k, gdim)`` for the gaps ``(m,)``
+    #: global nodes ``(j, l)`` and blocks ``(j, l gdim, l gdim)`` for the residual, from columns to rows.
     forces: tuple[Ints, Array]
 
     def along(self, X: Array) -> tuple[Array, Array]:
@@ -152,21 +148,13 @@ def warn_of_edges(problem: UnitedProblem) -> None:
 
 @dataclass(frozen=True)
 class RigidSlopes:
-    """Derivatives of the rows of couplings that move together, and of their forces, as ``ShapeSlopes``.
+    """Derivatives of the rows of couplings that move together, and of their forces, as ``ShapeSlopes``."""
 
-    Attributes:
-        one: the rows.
-        M: of each node, turns changes of reference positions with the part ``(n, gdim, gdim)``.
-        arms: the same for the arms of forces, which small rotations do not turn.
-        forces: of the bodies at the nodes, without forces of contacts ``(n, gdim)``.
-        rows: derivatives by y, without the moments.
-    """
-
-    one: RigidRows
-    M: Array
-    arms: Array
-    forces: Array
-    rows: ShapeSlopes
+    one: RigidRows  # the rows
+    M: Array  # of each node, turns changes of reference positions with the part ``(n, gdim, gdim)``
+    arms: Array  # the same for the arms of forces, which small rotations do not turn
+    forces: Array  # of the bodies at the nodes, without forces of contacts ``(n, gdim)``
+    rows: ShapeSlopes  # derivatives by y, without the moments
 
     def along(self, X: Array) -> tuple[Array, Array]:
         """As of ``ShapeSlopes`` (collective)."""

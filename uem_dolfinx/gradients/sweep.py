@@ -49,8 +49,7 @@ from uem_dolfinx.solve.united.system import BodySystem
 #: The part of rows that lean is found when it changes the load of the adjoint problem by no more than this part.
 #: [bound; load of the adjoint problem; -]
 LEANS_NO_MORE = 1e-12
-#: Solves for that part.
-#: [bound; solves; -]
+#: Solves for that part. [bound; solves; -]
 MOST_LEANING = 50
 
 

@@ -121,15 +121,12 @@ class Points:
     component ij of ``K(e) S`` is ``h coth(h) S_ij`` with ``h = e_i - e_j``.
 
     Attributes:
-        i: numbers of the points in the yield curve ``(m,)``.
-        C: right Cauchy-Green tensor ``(m, 3, 3)``.
-        committed: ``C_p^-1`` ``(m, 3, 3)``.
         mu, modulus, peeq: ``(m,)``, with the committed peeq.
     """
 
-    i: Ints
-    C: Array
-    committed: Array
+    i: Ints  # numbers of the points in the yield curve ``(m,)``
+    C: Array  # right Cauchy-Green tensor ``(m, 3, 3)``
+    committed: Array  # ``C_p^-1`` ``(m, 3, 3)``
     mu: Array
     modulus: Array
     peeq: Array
@@ -222,8 +219,7 @@ class _Strain:
         return (basis * weights[:, None, :]) @ basis.transpose(0, 2, 1)
 
 
-#: Projections of the components of symmetric tensors onto the volumetric part and onto deviators.
-#: [format; components; -]
+#: Projections of the components of symmetric tensors onto the volumetric part and onto deviators. [format; components; -]
 _VOLUME = np.outer([1, 1, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0]) / 3
 NO_VOLUME = np.eye(6) - _VOLUME
 

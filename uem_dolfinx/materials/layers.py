@@ -72,16 +72,11 @@ class Layers:
     ``Y + X(p)``. The slope over this strain is ``3 mu`` times the weights of all layers that are still elastic, so that
 
         yield stress i = Y + X_i + 3 mu p_i,    sum of the weights up to i = 3 mu / (3 mu + slope after i).
-
-    Attributes:
-        weights: fractions of the body, of sum 1 ``(n, j)``.
-        curve: yield stresses ``(n j,)``.
-        strains: plastic strains of the table ``(j,)``.
     """
 
-    weights: Array
-    curve: Linear
-    strains: Array
+    weights: Array  # fractions of the body, of sum 1 ``(n, j)``
+    curve: Linear  # yield stresses ``(n j,)``
+    strains: Array  # plastic strains of the table ``(j,)``
 
     @staticmethod
     def of(table: BackTable, yield_stress: Array, mu: Array) -> Layers:

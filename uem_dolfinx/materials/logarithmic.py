@@ -24,22 +24,14 @@ class Flowed:
     """Stress, history and tangent after a return, at n points; NaN where F cannot be inverted or is not finite.
 
     Symmetric tensors have k = 4 or 6 components in the order of ``Returned``.
-
-    Attributes:
-        stress: deviator of the Kirchhoff stress ``(n, k)``.
-        first_piola: the first Piola-Kirchhoff stress that belongs to it, components ``(n, c)``.
-        tangent: finds its derivative by the same components of F ``(n, c, c)``, symmetric.
-        plastic_strain: ``(1 - C_p^-1) / 2``, C_p the plastic right Cauchy-Green tensor ``(n, k)``.
-        peeq: equivalent plastic strain ``(n,)``.
-        energy: stored by the deviator, per reference volume ``(n,)``.
     """
 
-    stress: Array
-    first_piola: Array
-    tangent: Callable[[], Array]
-    plastic_strain: Array
-    peeq: Array
-    energy: Array
+    stress: Array  # deviator of the Kirchhoff stress ``(n, k)``
+    first_piola: Array  # the first Piola-Kirchhoff stress that belongs to it, components ``(n, c)``
+    tangent: Callable[[], Array]  # finds its derivative by the same components of F ``(n, c, c)``, symmetric
+    plastic_strain: Array  # ``(1 - C_p^-1) / 2``, C_p the plastic right Cauchy-Green tensor ``(n, k)``
+    peeq: Array  # equivalent plastic strain ``(n,)``
+    energy: Array  # stored by the deviator, per reference volume ``(n,)``
 
 
 def logarithmic_return(

@@ -12,8 +12,7 @@ from uem_dolfinx.arrays import Array
 #: [convention; yield stress; test_thresholds_motion.py::test_on_the_yield_surface]
 ON_SURFACE = 1e-10
 #: Returns that iterate, in plane stress, to saturating curves and around a back stress in finite strain, end with a Newton step below this
-#: part of their unknown; the next one would be its square.
-#: [bound; consistency parameter; -]
+#: part of their unknown; the next one would be its square. [bound; consistency parameter; -]
 RETURNED = 1e-10
 #: Those steps; they are quadratic, and random states took 7 at most, with a back stress and elastic strains of one half 18.
 #: [bound; steps; -]
@@ -28,21 +27,17 @@ class Returned:
     (11, 22, 33, sqrt(2) 23, sqrt(2) 13, sqrt(2) 12) in 3D, so that their dot product equals the tensors' inner product.
 
     Attributes:
-        stress: the stress in plane stress, otherwise its deviator, ``(n, k)``.
-        plastic_strain: ``(n, k)``.
-        peeq: equivalent plastic strain ``(n,)``.
         a, c, m: the tangent ``a I + c 1 x 1 - sum of m x m``, with the unit tensor 1 of the normal components and vectors m side by
             side, ``(n,)``, ``(n,)``, ``(n, k)`` or a multiple of k.
-        energy: stored by ``stress`` and by the back stress, per volume ``(n,)``.
     """
 
-    stress: Array
-    plastic_strain: Array
-    peeq: Array
+    stress: Array  # the stress in plane stress, otherwise its deviator, ``(n, k)``
+    plastic_strain: Array  # ``(n, k)``
+    peeq: Array  # equivalent plastic strain ``(n,)``
     a: Array
     c: Array
     m: Array
-    energy: Array
+    energy: Array  # stored by ``stress`` and by the back stress, per volume ``(n,)``
 
     @property
     def tangent(self) -> Array:
@@ -141,8 +136,7 @@ def plane_stress_return(
     return Returned((MODES.T @ modes).T, plastic_strain, peeq, shear, (area - shear) / 2, m, energy)
 
 
-#: From (11, 22, sqrt(2) 12) to the modes of plane stress, an orthogonal map.
-#: [format; components; -]
+#: From (11, 22, sqrt(2) 12) to the modes of plane stress, an orthogonal map. [format; components; -]
 MODES = np.array([[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.0, 0.5**0.5]]) * 2**0.5
 
 

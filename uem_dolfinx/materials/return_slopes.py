@@ -43,20 +43,18 @@ class ByReturn:
 
     Attributes:
         strain, plastic_strain: ``(n, k)``, with the committed plastic strain.
-        peeq: committed ``(n,)``.
         shear, area: by the logarithms of E / (1 + nu), and in plane stress of E / (1 - nu) ``(n,)``.
         yield_stress, hardening: ``(n,)``.
-        modulus: by the increase of the back stress per plastic strain ``(n,)``.
     """
 
     strain: Array
     plastic_strain: Array
-    peeq: Array
+    peeq: Array  # committed ``(n,)``
     shear: Array
     area: Array
     yield_stress: Array
     hardening: Array
-    modulus: Array
+    modulus: Array  # by the increase of the back stress per plastic strain ``(n,)``
 
 
 def radial_back(

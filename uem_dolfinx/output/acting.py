@@ -158,22 +158,15 @@ def _area_vectors(X: Array, faces: Ints, behind: Indices) -> Array:
 
 @dataclass(frozen=True)
 class Acting:
-    """Prescribed values, loads or springs of one kind at points, on rank 0.
+    """Prescribed values, loads or springs of one kind at points, on rank 0."""
 
-    Attributes:
-        kind: ``"held"``, ``"prescribed"``, ``"value"`` of a scalar field, ``"load"``, ``"body load"``, ``"velocity"``, ``"spring"``,
-            ``"equation"``, ``"turn"`` for a moment or a rotation, or ``"arm"``, from a node of a rigid part to its point.
-        name: label in the legend.
-        at: positions ``(n, gdim)``.
-        vectors: 1 for held components, or displacements, forces or velocities ``(n, k)``.
-        outward: outward unit normals there, zero off the surface ``(n, gdim)``.
-    """
-
+    #: ``"held"``, ``"prescribed"``, ``"value"`` of a scalar field, ``"load"``, ``"body load"``, ``"velocity"``, ``"spring"``,
+    #: ``"equation"``, ``"turn"`` for a moment or a rotation, or ``"arm"``, from a node of a rigid part to its point.
     kind: str
-    name: str
-    at: Array
-    vectors: Array
-    outward: Array
+    name: str  # label in the legend
+    at: Array  # positions ``(n, gdim)``
+    vectors: Array  # 1 for held components, or displacements, forces or velocities ``(n, k)``
+    outward: Array  # outward unit normals there, zero off the surface ``(n, gdim)``
 
 
 class Actions:

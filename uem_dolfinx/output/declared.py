@@ -22,44 +22,26 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 @dataclass(frozen=True)
 class Surface:
-    """One side of a contact, tie or other declaration of surfaces, on rank 0.
+    """One side of a contact, tie or other declaration of surfaces, on rank 0."""
 
-    Attributes:
-        name: label in the legend.
-        side: ``"contactor"``, also for other following surfaces; or ``"target"``, also for other followed surfaces.
-        pair: number of the declaration, the same for both sides.
-        corners: vertices around each facet ``(m, k, gdim)``.
-        normals: outward unit normals of the facets ``(m, gdim)``.
-        points: nodes, for parts without facets ``(n, gdim)``.
-        layer: number of earlier surfaces on the same part of the mesh.
-    """
-
-    name: str
-    side: str
-    pair: int
-    corners: Array
-    normals: Array
-    points: Array
-    layer: int
+    name: str  # label in the legend
+    side: str  # ``"contactor"``, also for other following surfaces; or ``"target"``, also for other followed surfaces
+    pair: int  # number of the declaration, the same for both sides
+    corners: Array  # vertices around each facet ``(m, k, gdim)``
+    normals: Array  # outward unit normals of the facets ``(m, gdim)``
+    points: Array  # nodes, for parts without facets ``(n, gdim)``
+    layer: int  # number of earlier surfaces on the same part of the mesh
 
 
 @dataclass(frozen=True)
 class Rigid:
-    """A rigid target, on rank 0.
+    """A rigid target, on rank 0."""
 
-    Attributes:
-        name: label in the legend.
-        pair: as in ``Surface``.
-        shape: with its position.
-        at: its point nearest to the contactors' middle ``(gdim,)``.
-        way: displacement of this point by the loads ``(gdim,)``.
-    """
-
-    name: str
-    pair: int
-    shape: Shape
-    at: Array
-    way: Array
+    name: str  # label in the legend
+    pair: int  # as in ``Surface``
+    shape: Shape  # with its position
+    at: Array  # its point nearest to the contactors' middle ``(gdim,)``
+    way: Array  # displacement of this point by the loads ``(gdim,)``
 
 
 @dataclass(frozen=True)
@@ -67,22 +49,18 @@ class Declared:
     """All declarations, on rank 0.
 
     Attributes:
-        cells: vertices around each cell in 2D, or around each surface facet in 3D ``(n, k, gdim)``.
-        body: of each of these ``(n,)``, counted in the order of the mesh's input.
-        outside: surface facets ``(m, k, gdim)``.
-        clamped: facets that are held in all components ``(m, k, gdim)``, and their outward normals ``(m, gdim)``.
         surfaces, rigid, acting: declarations of surfaces, rigid targets and points.
-        axis: whether x = 0 is an axis of revolution.
     """
 
-    cells: Array
-    body: Ints
-    outside: Array
+    cells: Array  # vertices around each cell in 2D, or around each surface facet in 3D ``(n, k, gdim)``
+    body: Ints  # of each of these ``(n,)``, counted in the order of the mesh's input
+    outside: Array  # surface facets ``(m, k, gdim)``
+    #: facets that are held in all components ``(m, k, gdim)``, and their outward normals ``(m, gdim)``.
     clamped: tuple[Array, Array]
     surfaces: list[Surface]
     rigid: list[Rigid]
     acting: list[Acting]
-    axis: bool
+    axis: bool  # whether x = 0 is an axis of revolution
 
 
 class Declarations:

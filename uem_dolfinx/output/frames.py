@@ -95,36 +95,23 @@ AROUND = {2: [0, 1], 3: [0, 1, 2], 4: [0, 1, 3, 2]}
 
 @dataclass(frozen=True)
 class Pieces:
-    """Coloured polygons, on rank 0: triangles of cells in 2D, surface facets in 3D.
+    """Coloured polygons, on rank 0: triangles of cells in 2D, surface facets in 3D."""
 
-    Attributes:
-        faces: vertices of each ``(n, 3)``, in 3D also ``(n, 4)``, as numbers in ``Frame.x``.
-        edges: vertices around each cell of a 2D scene, closed ``(n_cells, 4 or 5)``; empty in 3D.
-    """
-
-    faces: Ints
-    edges: Ints
+    faces: Ints  # vertices of each ``(n, 3)``, in 3D also ``(n, 4)``, as numbers in ``Frame.x``
+    edges: Ints  # vertices around each cell of a 2D scene, closed ``(n_cells, 4 or 5)``; empty in 3D
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A state of the scene, on rank 0.
+    """A state of the scene, on rank 0."""
 
-    Attributes:
-        x: displaced vertices ``(n, gdim)``.
-        values: of the field there ``(n,)``.
-        forces: positions, forces and pressures of the contactors, one for each contact.
-        state: label of the state, a word and a number.
-        cuts: triangles ``(k, 3, 3)`` of sections of the bodies by the window, in 3D, and the field at their corners ``(k, 3)``.
-        rigid: rigid targets at their present positions.
-    """
-
-    x: Array
-    values: Array
-    forces: list[tuple[Array, Array, Array]]
-    state: tuple[str, float]
+    x: Array  # displaced vertices ``(n, gdim)``
+    values: Array  # of the field there ``(n,)``
+    forces: list[tuple[Array, Array, Array]]  # positions, forces and pressures of the contactors, one for each contact
+    state: tuple[str, float]  # label of the state, a word and a number
+    #: triangles ``(k, 3, 3)`` of sections of the bodies by the window, in 3D, and the field at their corners ``(k, 3)``.
     cuts: tuple[Array, Array]
-    rigid: list[Shape]
+    rigid: list[Shape]  # rigid targets at their present positions
 
 
 class Gathering:

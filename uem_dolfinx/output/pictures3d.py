@@ -43,46 +43,27 @@ def require(comm: MPI.Comm) -> None:
 
 @dataclass(frozen=True)
 class Look:
-    """What all images of a film have in common.
+    """What all images of a film have in common."""
 
-    Attributes:
-        colours: matplotlib's colour map, with its number of colours.
-        below: colour of values below 0; None is the first of the map.
-        box: bounds of the visible part ``(3, 2)``.
-        cut: whether the surface is cut off at them.
-        view: direction from the scene to the eye ``(3,)``.
-        edges: draw the edges of the facets.
-        width: of an image before its margins are cut off, in points.
-        same: points that are nearer than this part of the scene's size are one.
-    """
-
-    colours: Any
-    below: str | None
-    box: Array
-    cut: bool
-    view: Array
-    edges: bool
-    width: int
-    same: float
+    colours: Any  # matplotlib's colour map, with its number of colours
+    below: str | None  # colour of values below 0; None is the first of the map
+    box: Array  # bounds of the visible part ``(3, 2)``
+    cut: bool  # whether the surface is cut off at them
+    view: Array  # direction from the scene to the eye ``(3,)``
+    edges: bool  # draw the edges of the facets
+    width: int  # of an image before its margins are cut off, in points
+    same: float  # points that are nearer than this part of the scene's size are one
 
 
 @dataclass(frozen=True)
 class Solid:
-    """The scene in one state.
+    """The scene in one state."""
 
-    Attributes:
-        points: vertices ``(n, 3)``.
-        values: there, from 0 to the number of colours ``(n,)``.
-        cuts: triangles in which bodies are cut open ``(k, 3, 3)``, and values at their corners ``(k, 3)``.
-        arrows: where they begin, and from there to their tips ``(m, 3)``.
-        rigid: rigid surfaces.
-    """
-
-    points: Array
-    values: Array
-    cuts: tuple[Array, Array]
-    arrows: tuple[Array, Array]
-    rigid: Sequence[Shape]
+    points: Array  # vertices ``(n, 3)``
+    values: Array  # there, from 0 to the number of colours ``(n,)``
+    cuts: tuple[Array, Array]  # triangles in which bodies are cut open ``(k, 3, 3)``, and values at their corners ``(k, 3)``
+    arrows: tuple[Array, Array]  # where they begin, and from there to their tips ``(m, 3)``
+    rigid: Sequence[Shape]  # rigid surfaces
 
 
 def images(faces: Ints, solids: Sequence[Solid], look: Look) -> list[Array]:

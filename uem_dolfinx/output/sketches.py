@@ -36,25 +36,15 @@ SIZED = ("prescribed", "body load", "velocity")
 
 @dataclass(frozen=True)
 class Look:
-    """Options of a sketch.
+    """Options of a sketch."""
 
-    Attributes:
-        arrows: further arrows: positions, directions and names.
-        cells: draw the edges of the cells.
-        window: bounds of the visible part ``(gdim, 2)``; None shows everything.
-        view: direction from the scene to the eye ``(3,)``, in 3D.
-        legend: draw a legend.
-        triad: draw the axes in a corner, in 3D.
-        width: of an image of a 3D scene, in points.
-    """
-
-    arrows: Sequence[tuple[Array, Array, str]]
-    cells: bool
-    window: Array | None
-    view: Array
-    legend: bool
-    triad: bool
-    width: int
+    arrows: Sequence[tuple[Array, Array, str]]  # further arrows: positions, directions and names
+    cells: bool  # draw the edges of the cells
+    window: Array | None  # bounds of the visible part ``(gdim, 2)``; None shows everything
+    view: Array  # direction from the scene to the eye ``(3,)``, in 3D
+    legend: bool  # draw a legend
+    triad: bool  # draw the axes in a corner, in 3D
+    width: int  # of an image of a 3D scene, in points
 
 
 def thinned(points: Array, spacing: float) -> Ints:

@@ -46,16 +46,11 @@ STEP = re.compile(
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers at nodes or cells, in the order of the mesh's input.
+    """Rows of numbers at nodes or cells, in the order of the mesh's input."""
 
-    Attributes:
-        rows: of this rank, in its own order ``(n, width)``.
-        numbering: their positions in the file.
-    """
-
-    rows: Callable[[], AnyArray]
+    rows: Callable[[], AnyArray]  # of this rank, in its own order ``(n, width)``
     width: int
-    numbering: Numbering
+    numbering: Numbering  # their positions in the file
 
     @property
     def size(self) -> int:

@@ -31,13 +31,11 @@ from uem_dolfinx.restart.interruption import Interruption, end_run
 from uem_dolfinx.restart.numbering import DIGEST, fingerprint, hashes
 from uem_dolfinx.restart.state import State
 
-#: Version of the file's layout and of the names in it.
-#: [format; -; test_checkpoint_refused.py::test_another_format]
+#: Version of the file's layout and of the names in it. [format; -; test_checkpoint_refused.py::test_another_format]
 FORMAT = 8
 #: First word of a checkpoint.
 MAGIC = "uem_dolfinx checkpoint"
-#: Bytes before the first table.
-#: [format; bytes; test_checkpoint_refused.py::test_damaged_files]
+#: Bytes before the first table. [format; bytes; test_checkpoint_refused.py::test_damaged_files]
 HEAD = 128
 #: How long a rank that leaves a loop waits for the others before it goes on without writing.
 #: [bound; seconds; test_left_early.py::test_left_by_one_rank]

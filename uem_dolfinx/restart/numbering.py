@@ -18,8 +18,7 @@ from uem_dolfinx.parallel import Exchange, agree
 #: Rows of a table that are hashed together; every rank holds whole chunks, so that the hash does not depend on the number of ranks.
 #: [format; rows; -]
 CHUNK = 1024
-#: Length of a hash.
-#: [format; bytes; -]
+#: Length of a hash. [format; bytes; -]
 DIGEST = 16
 
 

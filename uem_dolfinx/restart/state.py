@@ -25,8 +25,7 @@ from uem_dolfinx.restart.numbering import Numbering, fingerprint, hashes, mesh_f
 
 #: Description of an item of ``State.motions()`` in messages.
 A_MOTION = "what motions() of a state returned: None, or where a rigid surface is, as a dict"
-#: Sides of a cell are fewer.
-#: [format; sides; -]
+#: Sides of a cell are fewer. [format; sides; -]
 MOST_SIDES = 8
 
 

@@ -265,15 +265,12 @@ def _is_set(cell: CellType) -> bool:
 
 @dataclass(frozen=True)
 class Taken:
-    """Shares of a committed state: a value.
+    """Shares of a committed state: a value."""
 
-    Attributes:
-        held: share of the Dirichlet value of every unknown, ghosts included ``(n,)``, or one share of all; NaN where nodes were free at
-            the start of the ramp, since their positions depend on all parameters.
-        led: Constants, and contacts for their offsets, that steps have ramped, each with its value in that state and its share.
-    """
-
+    #: share of the Dirichlet value of every unknown, ghosts included ``(n,)``, or one share of all; NaN where nodes were free at
+    #: the start of the ramp, since their positions depend on all parameters.
     held: Array | float = 0.0
+    #: Constants, and contacts for their offsets, that steps have ramped, each with its value in that state and its share.
     led: tuple[tuple[Any, Any, float], ...] = ()
 
     def of(self, one: Any, other: float = 1.0) -> float:

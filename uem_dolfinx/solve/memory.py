@@ -21,27 +21,17 @@ from uem_dolfinx.solve.united.newton import Iteration
 
 @dataclass(frozen=True)
 class Memory:
-    """The committed state of a problem, from which its next step begins.
+    """The committed state of a problem, from which its next step begins."""
 
-    Attributes:
-        displacement: ``(n_local incl. ghosts,)``.
-        largest_forces: norm of the largest forces so far.
-        motions: of the pairs' rigid targets.
-        pairs: state of each pair.
-        of_users: multipliers and rotations of equations of users; None without.
-        histories: of the materials, values by name; empty for explicit steps, which are not repeated.
-        stiffness: diagonal of K ``(n_owned, block)``, which contacts use for directions before K is assembled again; None at first.
-        dynamics: state of the dynamics; None in statics, and for explicit steps.
-    """
-
-    displacement: Array
-    largest_forces: float
-    motions: list[Motion | None]
-    pairs: list[PairState]
-    of_users: Any
-    histories: list[dict[str, Array]]
+    displacement: Array  # ``(n_local incl. ghosts,)``
+    largest_forces: float  # norm of the largest forces so far
+    motions: list[Motion | None]  # of the pairs' rigid targets
+    pairs: list[PairState]  # state of each pair
+    of_users: Any  # multipliers and rotations of equations of users; None without
+    histories: list[dict[str, Array]]  # of the materials, values by name; empty for explicit steps, which are not repeated
+    #: diagonal of K ``(n_owned, block)``, which contacts use for directions before K is assembled again; None at first.
     stiffness: Array | None
-    dynamics: Any
+    dynamics: Any  # state of the dynamics; None in statics, and for explicit steps
 
     @classmethod
     def of(cls, problem: Any) -> Memory:

@@ -86,8 +86,7 @@ class Harmonic:
         return a + shift
 
 
-#: Relative error of the eigenvalues.
-#: [bound; the eigenvalue; -]
+#: Relative error of the eigenvalues. [bound; the eigenvalue; -]
 EIGENVALUE = 1e-10
 
 

@@ -32,8 +32,7 @@ from uem_dolfinx.restart.numbering import DIGEST
 if TYPE_CHECKING:
     from uem_dolfinx.dynamics.inertia import Dynamics
 
-#: Numbers of a form that are shown.
-#: [format; numbers; -]
+#: Numbers of a form that are shown. [format; numbers; -]
 SHOWN = 12
 #: Settings of every contact.
 OF_CONTACTS = ("coupling", "sliding", "normals", "thickness", "chords")

@@ -69,49 +69,32 @@ class ConvergedStep:
 
 @dataclass
 class Progress:
-    """Progress of a problem in steps and in load.
+    """Progress of a problem in steps and in load."""
 
-    Attributes:
-        steps: number of converged and committed steps.
-        resumed: number of checkpoints that have been read.
-        ramp: number of the present call of ``load_steps``, counted from 1; 0 before the first.
-        factor: load factor reached in it.
-        start: displacement at its beginning ``(n_local incl. ghosts,)``; with arc lengths at the beginning of its last step.
-        reach: arc length of the whole call, extrapolated from its first step; 0 without arc lengths.
-        dissipating: dissipated part of the energy of the last step, see ``Dissipation``.
-        control: length of its steps.
-        interruption: signals that are noted during steps.
-        end: ends the run on a signal of a given number, once the problem is in its last converged state.
-        inside: whether the caller works on a step, in the body of the loop.
-        step: name of the ``Step`` of this call.
-        loads: values of its Constants at its beginning.
-        carried: released forces at all unknowns at its beginning, ghosts included ``(n,)``; None if zero.
-        of_equations: multipliers of equations of users at their eliminated components, from a checkpoint ``(n_local, gdim)``.
-        taken: shares of the committed state, see ``solve.loading``.
-        began: shares at the beginning of the call.
-        left: load factors at which lists of several ``Step`` were left before their end, by the number of the call that the ``Step``
-            counts as.
-        number: identifies the problem in this script; its steps have it as ``_of_problem``.
-    """
-
-    steps: int = 0
-    resumed: int = 0
-    ramp: int = 0
-    factor: float = 0.0
+    steps: int = 0  # number of converged and committed steps
+    resumed: int = 0  # number of checkpoints that have been read
+    ramp: int = 0  # number of the present call of ``load_steps``, counted from 1; 0 before the first
+    factor: float = 0.0  # load factor reached in it
+    #: displacement at its beginning ``(n_local incl. ghosts,)``; with arc lengths at the beginning of its last step.
     start: Array = field(default_factory=lambda: np.zeros(0))
-    reach: float = 0.0
-    dissipating: float = 0.0
-    control: StepControl = field(default_factory=StepControl)
-    interruption: Interruption | None = None
+    reach: float = 0.0  # arc length of the whole call, extrapolated from its first step; 0 without arc lengths
+    dissipating: float = 0.0  # dissipated part of the energy of the last step, see ``Dissipation``
+    control: StepControl = field(default_factory=StepControl)  # length of its steps
+    interruption: Interruption | None = None  # signals that are noted during steps
+    #: ends the run on a signal of a given number, once the problem is in its last converged state.
     end: Callable[[int], NoReturn] = lambda number: end_run(number, "the problem is in its last converged state")
-    inside: bool = False
-    step: str = ""
-    loads: list[Any] = field(default_factory=list)
-    carried: Array | None = None
+    inside: bool = False  # whether the caller works on a step, in the body of the loop
+    step: str = ""  # name of the ``Step`` of this call
+    loads: list[Any] = field(default_factory=list)  # values of its Constants at its beginning
+    carried: Array | None = None  # released forces at all unknowns at its beginning, ghosts included ``(n,)``; None if zero
+    #: multipliers of equations of users at their eliminated components, from a checkpoint ``(n_local, gdim)``.
     of_equations: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    taken: Taken = field(default_factory=Taken)
-    began: Taken = field(default_factory=Taken)
+    taken: Taken = field(default_factory=Taken)  # shares of the committed state, see ``solve.loading``
+    began: Taken = field(default_factory=Taken)  # shares at the beginning of the call
+    #: load factors at which lists of several ``Step`` were left before their end, by the number of the call that the ``Step``
+    #: counts as.
     left: dict[int, float] = field(default_factory=dict)
+    #: identifies the problem in this script; its steps have it as ``_of_problem``.
     number: int = field(default_factory=partial(next, count(1)))
     _calls: int = 0
 

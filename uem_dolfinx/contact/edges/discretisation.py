@@ -37,22 +37,14 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class EdgeKinematics(PlacedOnTarget):
-    """Implements ``Kinematics``: nodes of edges that cross others.
-
-    Attributes:
-        which: contactors with a crossing, ascending ``(k,)``.
-        at: their crossings.
-        gaps: of these.
-        share: weight of each contactor in its gap, 1 without crossing ``(n,)``.
-        movable: contactors whose gap can be closed ``(n,)``.
-    """
+    """Implements ``Kinematics``: nodes of edges that cross others."""
 
     of: OnTarget
-    which: Ints
-    at: Opposite
-    gaps: EdgeGaps
-    share: Array
-    movable: Bools
+    which: Ints  # contactors with a crossing, ascending ``(k,)``
+    at: Opposite  # their crossings
+    gaps: EdgeGaps  # of these
+    share: Array  # weight of each contactor in its gap, 1 without crossing ``(n,)``
+    movable: Bools  # contactors whose gap can be closed ``(n,)``
 
     @classmethod
     def of_crossings(cls, of: OnTarget, points: Array, which: Ints, at: Opposite) -> EdgeKinematics:
@@ -175,8 +167,7 @@ def _moves_along(of: OnTarget, nodes: Ints, normal: Array) -> Array:
     return np.asarray(np.linalg.norm(free * normal[:, None], axis=2))
 
 
-#: Ways of contactors that count as too short to pass through an edge.
-#: [bound; the model's size; -]
+#: Ways of contactors that count as too short to pass through an edge. [bound; the model's size; -]
 NO_WAY = 1e6
 
 

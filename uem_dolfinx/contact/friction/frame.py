@@ -26,27 +26,17 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class Frame:
-    """Data of one placement for friction; immutable.
+    """Data of one placement for friction; immutable."""
 
-    Attributes:
-        ties: weights by which contactors follow other nodes and transmit friction to them.
-        way: weights of ``away``.
-        away: vectors from the anchors to the contactors, or relative motions since the last step ``(n, gdim)``.
-        tangents: tangential directions ``(n, gdim - 1, gdim)``.
-        free_tangents: tangential directions in which the relative motion is not prescribed ``(n, gdim - 1, gdim)``.
-        other_normals: normals of other rigid surfaces that hold the contactors, or zero ``(n, k, gdim)``; k is 0 if none holds any.
-        prescribed: whether any contactor has a Dirichlet condition.
-        cornered: contactors held in a corner, with friction only along its edge ``(n,)``.
-    """
-
-    ties: Ties
-    way: Ties
-    away: Array
-    tangents: Array
-    free_tangents: Array
+    ties: Ties  # weights by which contactors follow other nodes and transmit friction to them
+    way: Ties  # weights of ``away``
+    away: Array  # vectors from the anchors to the contactors, or relative motions since the last step ``(n, gdim)``
+    tangents: Array  # tangential directions ``(n, gdim - 1, gdim)``
+    free_tangents: Array  # tangential directions in which the relative motion is not prescribed ``(n, gdim - 1, gdim)``
+    #: normals of other rigid surfaces that hold the contactors, or zero ``(n, k, gdim)``; k is 0 if none holds any.
     other_normals: Array
-    prescribed: bool
-    cornered: Bools
+    prescribed: bool  # whether any contactor has a Dirichlet condition
+    cornered: Bools  # contactors held in a corner, with friction only along its edge ``(n,)``
 
     @classmethod
     def of(cls, kinematics: Kinematics, away: Array, way: Ties | None, other_normals: Array, prescribed: bool) -> Frame:

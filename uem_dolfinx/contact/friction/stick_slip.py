@@ -35,23 +35,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Pivot:
-    """Record of the exchanges of one linearised problem, and data of slip directions, ``(n,)`` unless stated.
+    """Record of the exchanges of one linearised problem, and data of slip directions, ``(n,)`` unless stated."""
 
-    Attributes:
-        released: contactors that have been released.
-        turned: contactors whose slip has been reversed.
-        begun: contactors that have begun to slip.
-        stiffness: stiffness c.
-        q: forces that define the slip directions ``(n, gdim)``.
-        tau: force part of ``q`` ``(n, gdim)``.
-    """
-
-    released: Bools
-    turned: Bools
-    begun: Bools
-    stiffness: Array
-    q: Array
-    tau: Array
+    released: Bools  # contactors that have been released
+    turned: Bools  # contactors whose slip has been reversed
+    begun: Bools  # contactors that have begun to slip
+    stiffness: Array  # stiffness c
+    q: Array  # forces that define the slip directions ``(n, gdim)``
+    tau: Array  # force part of ``q`` ``(n, gdim)``
 
     @classmethod
     def begin(cls, stiffness: Array, q: Array, tau: Array) -> Pivot:
@@ -62,17 +53,11 @@ class Pivot:
 
 @dataclass(frozen=True)
 class LastStep:
-    """Data of the last step's end, for contactors that follow other nodes in a mean.
+    """Data of the last step's end, for contactors that follow other nodes in a mean."""
 
-    Attributes:
-        kinematics: of the contactors, with the weights of followed nodes.
-        x: positions of the owned nodes ``(n_owned, gdim)``.
-        motion: of a rigid target; None if it had not moved.
-    """
-
-    kinematics: Kinematics
-    x: Array
-    motion: Motion | None
+    kinematics: Kinematics  # of the contactors, with the weights of followed nodes
+    x: Array  # positions of the owned nodes ``(n_owned, gdim)``
+    motion: Motion | None  # of a rigid target; None if it had not moved
 
     @property
     def ties(self) -> Ties:
@@ -103,38 +88,23 @@ LEAST_TURN = 0.999
 
 @dataclass(frozen=True)
 class Seen:
-    """Forces and slips that decide on stick and slip, current or predicted.
+    """Forces and slips that decide on stick and slip, current or predicted."""
 
-    Attributes:
-        lam: normal force ``(n,)``.
-        tau: tangential force ``(n, gdim)``.
-        bound: limit of the tangential force ``(n,)``.
-        slip: relative motion along the target since the last step ``(n, gdim)``.
-        forced: prescribed part of the slip, a length ``(n,)``.
-    """
-
-    lam: Array
-    tau: Array
-    bound: Array
-    slip: Array
-    forced: Array
+    lam: Array  # normal force ``(n,)``
+    tau: Array  # tangential force ``(n, gdim)``
+    bound: Array  # limit of the tangential force ``(n,)``
+    slip: Array  # relative motion along the target since the last step ``(n, gdim)``
+    forced: Array  # prescribed part of the slip, a length ``(n,)``
 
 
 @dataclass(frozen=True)
 class FrictionViolations(Violations):
-    """Contactors that violate the conditions of contact or of friction, each ``(n,)``.
+    """Contactors that violate the conditions of contact or of friction, each ``(n,)``."""
 
-    Attributes:
-        slide: sticking contactors whose force exceeds the limit.
-        hold: slipping contactors that move against their slip direction.
-        driven: contactors with prescribed slip.
-        seen: forces and slips for this decision.
-    """
-
-    slide: Bools
-    hold: Bools
-    driven: Bools
-    seen: Seen
+    slide: Bools  # sticking contactors whose force exceeds the limit
+    hold: Bools  # slipping contactors that move against their slip direction
+    driven: Bools  # contactors with prescribed slip
+    seen: Seen  # forces and slips for this decision
 
     @property
     def count(self) -> int:

@@ -103,8 +103,7 @@ def corners_of(contact: Contact, config: Configuration, order: int) -> list[Furt
         return []
 
 
-#: How many crossings a node may have at once; two edges of a rod cross another one between two nodes.
-#: [bound; crossings; -]
+#: How many crossings a node may have at once; two edges of a rod cross another one between two nodes. [bound; crossings; -]
 LISTS = 2
 
 

@@ -16,35 +16,21 @@ from uem_dolfinx.geometry.skin import Skin
 
 
 class Touch(NamedTuple):
-    """Two bodies that touch, or a body and a rigid surface.
+    """Two bodies that touch, or a body and a rigid surface."""
 
-    Attributes:
-        first: name of the first body.
-        second: name of the second body or rigid surface.
-        n_active: number of active contactors.
-        force: on the first ``(gdim,)``.
-    """
-
-    first: str
-    second: str
-    n_active: int
-    force: Array
+    first: str  # name of the first body
+    second: str  # name of the second body or rigid surface
+    n_active: int  # number of active contactors
+    force: Array  # on the first ``(gdim,)``
 
 
 class Pair(NamedTuple):
-    """Forces and heat between two bodies, or a body and a rigid surface.
+    """Forces and heat between two bodies, or a body and a rigid surface."""
 
-    Attributes:
-        touch: names, number of contactors and force.
-        moment: moment on the first.
-        normal: sum of the normal forces.
-        heat: power from the first to the second in one field, without frictional heat.
-    """
-
-    touch: Touch
-    moment: Array
-    normal: float
-    heat: float
+    touch: Touch  # names, number of contactors and force
+    moment: Array  # moment on the first
+    normal: float  # sum of the normal forces
+    heat: float  # power from the first to the second in one field, without frictional heat
 
 
 def sums_of_pairs(

@@ -129,8 +129,7 @@ class Bilinear:
 #: Stiffness before damage, without one given: so many times the least at which the law can soften, strength^2 / (2 energy).
 #: [convention; the least stiffness; test_cohesive_laws.py::test_the_stiffness_before_damage]
 STIFFER = 100.0
-#: Length of a complex step, over the quantity: its square is below rounding.
-#: [format; the quantity; -]
+#: Length of a complex step, over the quantity: its square is below rounding. [format; the quantity; -]
 COMPLEX_STEP = np.finfo(float).eps ** 2
 
 
@@ -145,23 +144,14 @@ class Softening(Protocol):
 
 
 class Response(NamedTuple):
-    """Tractions on openings.
+    """Tractions on openings."""
 
-    Attributes:
-        traction: that resists the opening, per area ``(n, gdim)``.
-        tangent: its derivative by the opening ``(n, gdim, gdim)``.
-        secant: stiffness without growth of the damage, positive ``(n, gdim, gdim)``.
-        damage: 0 to 1 ``(n,)``.
-        delayed: damage that acts, behind ``damage`` by the viscosity ``(n,)``.
-        permanent: plastic opening ``(n, gdim)``.
-    """
-
-    traction: Array
-    tangent: Array
-    secant: Array
-    damage: Array
-    delayed: Array
-    permanent: Array
+    traction: Array  # that resists the opening, per area ``(n, gdim)``
+    tangent: Array  # its derivative by the opening ``(n, gdim, gdim)``
+    secant: Array  # stiffness without growth of the damage, positive ``(n, gdim, gdim)``
+    damage: Array  # 0 to 1 ``(n,)``
+    delayed: Array  # damage that acts, behind ``damage`` by the viscosity ``(n,)``
+    permanent: Array  # plastic opening ``(n, gdim)``
 
 
 SOFTENINGS: dict[str, type[Softening]] = {"bilinear": Bilinear, "exponential": ExponentialSoftening}

@@ -264,15 +264,10 @@ class PowerLaw:
 
 @dataclass(frozen=True)
 class PressureTable:
-    """Pressures between the points of a table are linear; below its first gap they continue with its first slope, above its last one 0.
+    """Pressures between the points of a table are linear; below its first gap they continue with its first slope, above its last one 0."""
 
-    Attributes:
-        gaps: ascending.
-        values: pressures, not increasing, the last one 0.
-    """
-
-    gaps: tuple[float, ...]
-    values: tuple[float, ...]
+    gaps: tuple[float, ...]  # ascending
+    values: tuple[float, ...]  # pressures, not increasing, the last one 0
 
     @classmethod
     def of(cls, table: Any) -> PressureTable:

@@ -43,8 +43,7 @@ PARALLEL = 1e-10
 #: [convention; cosine; test_mortar.py::test_rigid_surfaces_cover_what_faces_them]
 COVERS = 0.75
 #: One that it has covered before stays covered as long as this cosine is larger: a facet that turns with what covers it would else be
-#: covered and let go for ever.
-#: [convention; cosine; test_mortar.py::test_rigid_surfaces_go_on_covering]
+#: covered and let go for ever. [convention; cosine; test_mortar.py::test_rigid_surfaces_go_on_covering]
 GOES_ON_COVERING = 0.7
 
 

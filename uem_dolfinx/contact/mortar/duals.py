@@ -81,25 +81,15 @@ def basis_of(shape: FacetShape) -> Basis:
 
 @dataclass(frozen=True)
 class Covered:
-    """Integrals over the covered parts of ``m`` facets in ``k`` pairs.
+    """Integrals over the covered parts of ``m`` facets in ``k`` pairs."""
 
-    Attributes:
-        facet: of each pair ``(k,)``, ascending.
-        D: integrals of the functions ``(m, nn)``.
-        M: of their products ``(m, nn, nn)``.
-        G: of their products with the gap minus the offset ``(m, nn)``.
-        N: of their products with the target's shape functions, pair by pair ``(k, nn, nt)``.
-        own: of their products with each other and with the gap, pair by pair ``(k, nn, nn + 1)``.
-        full: of the functions over the whole facets ``(m, nn)``.
-    """
-
-    facet: Ints
-    D: Array
-    M: Array
-    G: Array
-    N: Array
-    own: Array
-    full: Array
+    facet: Ints  # of each pair ``(k,)``, ascending
+    D: Array  # integrals of the functions ``(m, nn)``
+    M: Array  # of their products ``(m, nn, nn)``
+    G: Array  # of their products with the gap minus the offset ``(m, nn)``
+    N: Array  # of their products with the target's shape functions, pair by pair ``(k, nn, nt)``
+    own: Array  # of their products with each other and with the gap, pair by pair ``(k, nn, nn + 1)``
+    full: Array  # of the functions over the whole facets ``(m, nn)``
 
     @classmethod
     def of(cls, segments: Segments, b: Array, N: Array, facet: Ints, full: Array, offset: Array | None = None) -> Covered:
@@ -140,25 +130,15 @@ def products(left: Array, right: Array) -> Array:
 
 @dataclass(frozen=True)
 class Duals:
-    """Dual functions of ``m`` facets.
+    """Dual functions of ``m`` facets."""
 
-    Attributes:
-        A: combinations of the functions b ``(m, nn, nn)``.
-        C: their integrals with the functions b ``(m, nn, nn)``.
-        kept: nodes whose share is sufficiently covered for a dual function of their own ``(m, nn)``.
-        own: nodes with such a function, except the foremost ``(m, nn)``.
-        foremost: node whose dual function completes the sum to one ``(m,)``.
-        inverse: of the integrals of the functions' products; zero on facets without functions of their own ``(m, nn, nn)``.
-        gap: coefficients of the gap's projection onto the functions b ``(m, nn)``.
-    """
-
-    A: Array
-    C: Array
-    kept: Bools
-    own: Bools
-    foremost: Ints
-    inverse: Array
-    gap: Array
+    A: Array  # combinations of the functions b ``(m, nn, nn)``
+    C: Array  # their integrals with the functions b ``(m, nn, nn)``
+    kept: Bools  # nodes whose share is sufficiently covered for a dual function of their own ``(m, nn)``
+    own: Bools  # nodes with such a function, except the foremost ``(m, nn)``
+    foremost: Ints  # node whose dual function completes the sum to one ``(m,)``
+    inverse: Array  # of the integrals of the functions' products; zero on facets without functions of their own ``(m, nn, nn)``
+    gap: Array  # coefficients of the gap's projection onto the functions b ``(m, nn)``
 
     def spread(self, facet: Ints, b: Array, multipliers: Array) -> tuple[Array, Array]:
         """Derivative of ``sum l_j int psi_j f`` by the covered part at points of the facets: factors of f and of its projection.

@@ -25,8 +25,7 @@ from uem_dolfinx.contact.mortar.segment_motions import Motions, Sides, dual_tang
 from uem_dolfinx.contact.mortar.tangent import SegmentPoints
 from uem_dolfinx.geometry.shapes import FacetShape, tangents
 
-#: Pairs of facets whose second derivatives are made at once, in a few times the memory that these take.
-#: [bound; pairs; -]
+#: Pairs of facets whose second derivatives are made at once, in a few times the memory that these take. [bound; pairs; -]
 AT_ONCE = 1000
 
 

@@ -123,18 +123,12 @@ class Contactors(OnTarget):
 
 @dataclass(frozen=True)
 class MortarKinematics(PlacedOnTarget):
-    """Implements ``Kinematics`` with weighted gaps, which the projection contains with the directions of the plain rows.
-
-    Attributes:
-        rows: all equations and their data.
-        movable: contactors that can move along the normal, or whose followed nodes can ``(n,)``.
-        out: contactors that must not touch the target ``(n,)``, or None.
-    """
+    """Implements ``Kinematics`` with weighted gaps, which the projection contains with the directions of the plain rows."""
 
     of: Contactors
-    rows: WeightedRows
-    movable: Bools
-    out: Bools | None = None
+    rows: WeightedRows  # all equations and their data
+    movable: Bools  # contactors that can move along the normal, or whose followed nodes can ``(n,)``
+    out: Bools | None = None  # contactors that must not touch the target ``(n,)``, or None
 
     @property
     def corners(self) -> None:

@@ -167,49 +167,33 @@ class Pieces(NamedTuple):
 
 @dataclass(frozen=True)
 class WeightedRows:
-    """Equations of all contactors, one per contactor.
+    """Equations of all contactors, one per contactor."""
 
-    Attributes:
-        sharing: number of contactors with the same row, of which each has an equal part of the force, see ``Seam`` ``(n,)``.
-        equations: in the order of the contactors, all inactive. Their left sides are the derivatives of the gaps.
-        length: divisors of these equations ``(n,)``.
-        plain: the same equations with only the derivatives along the normals of the contactor's facets.
-        points: quadrature points of the segments at the time when the rows were made.
-        covered: contactors whose equation comes from segments ``(n,)``.
-        facets: numbers of the contactor's facets near the target ``(m,)``.
-        ratio: covered part of the contactor's share of its facets ``(n,)``.
-        area: integral of the contactor's dual function, the area of its multiplier as a pressure, over ``sharing`` ``(n,)``.
-        stretch: current over reference area of the facets around the contactor ``(n,)``.
-        share: contact force of this area over the multiplier ``(n,)``; 1 except at the middle nodes of quadratic facets.
-        weights: terms by which contactors follow other nodes in the same mean, for friction; None without friction.
-        normal: directions of the gaps' derivatives by the contactors' own displacements, normal to friction ``(n, gdim)``; None
-            without friction.
-        slope: lengths of these derivatives over the lengths for the plain rows ``(n,)``; None without friction.
-        push: sum of the lengths of each facet's part of these derivatives, over the lengths for the plain rows ``(n,)``: the sum of
-            the facets' forces along their own normals; None without friction.
-        parts: each facet's part of the nodes' own derivatives ``(m, nc, gdim)``.
-        whole: integral of the contactor's dual function times its own shape function, the divisor of ``weights`` ``(n,)``; None
-            without friction.
-        facing: keys, independent of the partition, of contactor and target facets that cover each other ``(p, 2)``.
-    """
-
-    sharing: Array
-    equations: UnitingEquations
-    length: Array
-    plain: UnitingEquations
-    points: SegmentPoints
-    facets: Ints
-    covered: Bools
-    ratio: Array
-    area: Array
-    stretch: Array
-    share: Array
+    sharing: Array  # number of contactors with the same row, of which each has an equal part of the force, see ``Seam`` ``(n,)``
+    equations: UnitingEquations  # in the order of the contactors, all inactive. Their left sides are the derivatives of the gaps
+    length: Array  # divisors of these equations ``(n,)``
+    plain: UnitingEquations  # the same equations with only the derivatives along the normals of the contactor's facets
+    points: SegmentPoints  # quadrature points of the segments at the time when the rows were made
+    facets: Ints  # numbers of the contactor's facets near the target ``(m,)``
+    covered: Bools  # contactors whose equation comes from segments ``(n,)``
+    ratio: Array  # covered part of the contactor's share of its facets ``(n,)``
+    area: Array  # integral of the contactor's dual function, the area of its multiplier as a pressure, over ``sharing`` ``(n,)``
+    stretch: Array  # current over reference area of the facets around the contactor ``(n,)``
+    share: Array  # contact force of this area over the multiplier ``(n,)``; 1 except at the middle nodes of quadratic facets
+    #: terms by which contactors follow other nodes in the same mean, for friction; None without friction.
     weights: Terms | None = None
+    #: directions of the gaps' derivatives by the contactors' own displacements, normal to friction ``(n, gdim)``; None
+    #: without friction.
     normal: Array | None = None
-    slope: Array | None = None
+    slope: Array | None = None  # lengths of these derivatives over the lengths for the plain rows ``(n,)``; None without friction
+    #: sum of the lengths of each facet's part of these derivatives, over the lengths for the plain rows ``(n,)``: the sum of
+    #: the facets' forces along their own normals; None without friction.
     push: Array | None = None
-    parts: Array | None = None
+    parts: Array | None = None  # each facet's part of the nodes' own derivatives ``(m, nc, gdim)``
+    #: integral of the contactor's dual function times its own shape function, the divisor of ``weights`` ``(n,)``; None
+    #: without friction.
     whole: Array | None = None
+    #: keys, independent of the partition, of contactor and target facets that cover each other ``(p, 2)``.
     facing: Ints | None = None
 
     def at_gaps(self, gap: Array) -> WeightedRows:

@@ -14,19 +14,12 @@ from uem_dolfinx.geometry.shapes import FacetShape, area_vectors
 
 @dataclass(frozen=True)
 class Motions:
-    """Motions of contactor points relative to the target, as linear functions of the nodes' displacements.
+    """Motions of contactor points relative to the target, as linear functions of the nodes' displacements."""
 
-    Attributes:
-        phi: the contactor's shape functions ``(q, nc)``.
-        N: the target's ``(q, nt)``.
-        part: gap over the size of the contactor facet ``(q,)``.
-        turning: derivative of its area vector a by the displacements ``(q, nc, gdim, gdim)``.
-    """
-
-    phi: Array
-    N: Array
-    part: Array
-    turning: Array
+    phi: Array  # the contactor's shape functions ``(q, nc)``
+    N: Array  # the target's ``(q, nt)``
+    part: Array  # gap over the size of the contactor facet ``(q,)``
+    turning: Array  # derivative of its area vector a by the displacements ``(q, nc, gdim, gdim)``
 
     def __getitem__(self, which: Bools) -> Motions:
         return Motions(self.phi[which], self.N[which], self.part[which], self.turning[which])
@@ -53,43 +46,25 @@ class Motions:
 
 @dataclass(frozen=True)
 class Sides:
-    """Points on sides of target facets over contactor facets.
+    """Points on sides of target facets over contactor facets."""
 
-    Attributes:
-        pair: number of the pair of facets, ascending ``(q,)``.
-        xi: reference coordinates on the contactor's facets ``(q, fdim)``.
-        b: values of the contactor's basis functions ``(q, nc)``.
-        N: the target's shape functions ``(q, nt)``.
-        gap: ``(q,)``.
-        offset: part of the gap that is an offset ``(q,)``.
-        t: derivative of the gap by the position ``(q, gdim)``.
-        slope: derivative of the gap outward across the side ``(q,)``.
-        outward: direction out of the target facet across the side, in the contactor's plane ``(q, gdim)``.
-        motions: motions of the points relative to the target.
-        way: displacement of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``.
-        ahead: direction along the side in that plane; zero in 2D ``(q, gdim)``.
-        shift: derivative of the target's shape functions along ``ahead`` ``(q, nt)``.
-        cut: displacement along the side, per motion, of the point where the side leaves the contactor facet; else zero ``(q, gdim)``.
-        weight: of the quadrature, a length in 3D; in axisymmetry ``2 pi r`` ``(q,)``.
-        end: whether the target ends there ``(q,)``.
-    """
-
-    pair: Ints
-    xi: Array
-    b: Array
-    N: Array
-    gap: Array
-    offset: Array
-    t: Array
-    slope: Array
-    outward: Array
-    motions: Motions
-    way: Array
-    ahead: Array
-    shift: Array
+    pair: Ints  # number of the pair of facets, ascending ``(q,)``
+    xi: Array  # reference coordinates on the contactor's facets ``(q, fdim)``
+    b: Array  # values of the contactor's basis functions ``(q, nc)``
+    N: Array  # the target's shape functions ``(q, nt)``
+    gap: Array  # ``(q,)``
+    offset: Array  # part of the gap that is an offset ``(q,)``
+    t: Array  # derivative of the gap by the position ``(q, gdim)``
+    slope: Array  # derivative of the gap outward across the side ``(q,)``
+    outward: Array  # direction out of the target facet across the side, in the contactor's plane ``(q, gdim)``
+    motions: Motions  # motions of the points relative to the target
+    way: Array  # displacement of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``
+    ahead: Array  # direction along the side in that plane; zero in 2D ``(q, gdim)``
+    shift: Array  # derivative of the target's shape functions along ``ahead`` ``(q, nt)``
+    #: displacement along the side, per motion, of the point where the side leaves the contactor facet; else zero ``(q, gdim)``.
     cut: Array
-    weight: Array
-    end: Bools
+    weight: Array  # of the quadrature, a length in 3D; in axisymmetry ``2 pi r`` ``(q,)``
+    end: Bools  # whether the target ends there ``(q,)``
 
     def gap_changes(self, n: Array, size: Array) -> Array:
         """Derivatives of the gaps, with normals ``(q, gdim)`` and sizes ``(q,)`` of the contactor facets ``(q, nc + nt, gdim)``."""
@@ -112,29 +87,17 @@ class Sides:
 
 @dataclass(frozen=True)
 class SidePoints:
-    """Points on straight sides of target facets over contactor facets, in the planes of the contactor facets.
+    """Points on straight sides of target facets over contactor facets, in the planes of the contactor facets."""
 
-    Attributes:
-        pair: number of the pair of facets, ascending ``(q,)``.
-        at: positions ``(q, fdim)``.
-        eta: reference coordinates on the target facets ``(q, fdim)``.
-        outward: direction out of the target facet ``(q, fdim)``.
-        ahead: direction along the side, zero in 2D ``(q, fdim)``.
-        stride: derivative of ``eta`` along ``ahead`` ``(q, fdim)``.
-        weight: of the quadrature, a length in 3D; 1 in 2D ``(q,)``.
-        cut: as in ``Sides``, per motion in the plane ``(q, fdim)``.
-        corners: corners of the side, as numbers within the target facet ``(q, gdim - 1)``.
-    """
-
-    pair: Ints
-    at: Array
-    eta: Array
-    outward: Array
-    ahead: Array
-    stride: Array
-    weight: Array
-    cut: Array
-    corners: Ints
+    pair: Ints  # number of the pair of facets, ascending ``(q,)``
+    at: Array  # positions ``(q, fdim)``
+    eta: Array  # reference coordinates on the target facets ``(q, fdim)``
+    outward: Array  # direction out of the target facet ``(q, fdim)``
+    ahead: Array  # direction along the side, zero in 2D ``(q, fdim)``
+    stride: Array  # derivative of ``eta`` along ``ahead`` ``(q, fdim)``
+    weight: Array  # of the quadrature, a length in 3D; 1 in 2D ``(q,)``
+    cut: Array  # as in ``Sides``, per motion in the plane ``(q, fdim)``
+    corners: Ints  # corners of the side, as numbers within the target facet ``(q, gdim - 1)``
 
 
 def ends(own: Array, other: FacetShape, its: Array) -> SidePoints:

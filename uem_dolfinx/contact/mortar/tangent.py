@@ -41,49 +41,27 @@ from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, area_vectors, fac
 
 @dataclass(frozen=True)
 class SegmentPoints:
-    """Quadrature points of segments with all that derivatives there need.
+    """Quadrature points of segments with all that derivatives there need."""
 
-    Attributes:
-        segments: of ``k`` pairs.
-        facet: contactor facet of each pair, among ``m`` ``(k,)``, ascending.
-        nodes: global nodes of the contactor facets ``(m, nc)``.
-        opposite: of the target facets, pair by pair ``(k, nt)``; without any where the target is rigid.
-        planes: of the contactor facets.
-        duals: dual functions of the contactor facets.
-        covered: integrals over them.
-        b: functions of the basis at the points ``(q, nc)``.
-        phi: the contactor's shape functions there ``(q, nc)``.
-        N: the target's ``(q, nt)``.
-        to_gap: change of the gap with ``x - y``, called t above; a rigid target's normal ``(q, gdim)``.
-        shape: of the contactor's facets.
-        other: of the target's; None where it is rigid.
-        x: nodes of the contactor facets ``(m, nc, gdim)``.
-        y: of the target facets, pair by pair ``(k, nt, gdim)``.
-        sign: of the contactor facets, as for ``Planes.of`` ``(m,)``.
-        shape_operator: second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh.
-        radius: of the circles of points in axisymmetry, included in their weights ``(q,)``; None otherwise.
-        offsets: of the gap at the contactor facets' nodes ``(m, nc)``; None for none.
-    """
-
-    segments: Segments
-    facet: Ints
-    nodes: Ints
-    opposite: Ints
-    planes: Planes
-    duals: Duals
-    covered: Covered
-    b: Array
-    phi: Array
-    N: Array
-    to_gap: Array
-    shape: FacetShape
-    other: FacetShape | None
-    x: Array
-    y: Array
-    sign: Array
-    shape_operator: Array | None
-    radius: Array | None = None
-    offsets: Array | None = None
+    segments: Segments  # of ``k`` pairs
+    facet: Ints  # contactor facet of each pair, among ``m`` ``(k,)``, ascending
+    nodes: Ints  # global nodes of the contactor facets ``(m, nc)``
+    opposite: Ints  # of the target facets, pair by pair ``(k, nt)``; without any where the target is rigid
+    planes: Planes  # of the contactor facets
+    duals: Duals  # dual functions of the contactor facets
+    covered: Covered  # integrals over them
+    b: Array  # functions of the basis at the points ``(q, nc)``
+    phi: Array  # the contactor's shape functions there ``(q, nc)``
+    N: Array  # the target's ``(q, nt)``
+    to_gap: Array  # change of the gap with ``x - y``, called t above; a rigid target's normal ``(q, gdim)``
+    shape: FacetShape  # of the contactor's facets
+    other: FacetShape | None  # of the target's; None where it is rigid
+    x: Array  # nodes of the contactor facets ``(m, nc, gdim)``
+    y: Array  # of the target facets, pair by pair ``(k, nt, gdim)``
+    sign: Array  # of the contactor facets, as for ``Planes.of`` ``(m,)``
+    shape_operator: Array | None  # second derivatives of the gap with x on a rigid target ``(q, gdim, gdim)``; None on a mesh
+    radius: Array | None = None  # of the circles of points in axisymmetry, included in their weights ``(q,)``; None otherwise
+    offsets: Array | None = None  # of the gap at the contactor facets' nodes ``(m, nc)``; None for none
 
     @cached_property
     def offset(self) -> Array:

@@ -24,19 +24,12 @@ from uem_dolfinx.geometry.shapes import FacetShape, tangents
 
 @dataclass(frozen=True)
 class Frictional:
-    """Contactors with friction, covered by the target.
+    """Contactors with friction, covered by the target."""
 
-    Attributes:
-        which: places among the contactors, ascending ``(k,)``.
-        normal: directions of their equations ``(k, gdim)``.
-        tau: friction, transmitted by the weights of followed nodes ``(k, gdim)``.
-        slips: slipping contactors, whose friction depends on the normal force ``(k,)``.
-    """
-
-    which: Ints
-    normal: Array
-    tau: Array
-    slips: Bools
+    which: Ints  # places among the contactors, ascending ``(k,)``
+    normal: Array  # directions of their equations ``(k, gdim)``
+    tau: Array  # friction, transmitted by the weights of followed nodes ``(k, gdim)``
+    slips: Bools  # slipping contactors, whose friction depends on the normal force ``(k,)``
 
 
 def handing_on(at: SegmentPoints, traction: Array) -> list[tuple[Ints, Array]]:
@@ -122,21 +115,13 @@ def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: I
 
 
 class RowSlopes(NamedTuple):
-    """Derivatives of the directions and sizes of contactors' own rows, by the positions of nodes.
+    """Derivatives of the directions and sizes of contactors' own rows, by the positions of nodes."""
 
-    Attributes:
-        nodes: that some rows depend on or follow, -1 for no node ``(k, c)``.
-        weight: with which the contactor's friction acts on them ``(k, c)``.
-        normal: derivatives of the rows' directions, whose parts along the target count ``(k, c, gdim, gdim)``.
-        longer: relative growth of the force along them, of a unit of ``push`` ``(k, c, gdim)``.
-        whole: of the integral of the dual function times the contactor's own shape function ``(k, c, gdim)``.
-    """
-
-    nodes: Ints
-    weight: Array
-    normal: Array
-    longer: Array
-    whole: Array
+    nodes: Ints  # that some rows depend on or follow, -1 for no node ``(k, c)``
+    weight: Array  # with which the contactor's friction acts on them ``(k, c)``
+    normal: Array  # derivatives of the rows' directions, whose parts along the target count ``(k, c, gdim, gdim)``
+    longer: Array  # relative growth of the force along them, of a unit of ``push`` ``(k, c, gdim)``
+    whole: Array  # of the integral of the dual function times the contactor's own shape function ``(k, c, gdim)``
 
 
 def row_slopes(elimination: Elimination, rows: WeightedRows, which: Ints, unit: Array, weights: Terms) -> RowSlopes:

@@ -40,22 +40,14 @@ class Family:
 
     Every term subtracts ``weight`` times the gap of a parent, a vertex or an edge's middle, from the gap of a child, a contactor in
     the middle of an edge or a facet. Parents may belong to other ranks; children are owned by this rank.
-
-    Attributes:
-        config: configuration of the displacement, of degree 2.
-        nodes: owned contactor nodes ``(n,)``.
-        child: index of the term's contactor ``(k,)``.
-        parent: local node of the term's parent ``(k,)``.
-        weight: weight of each term ``(k,)``.
-        of_facet: whether the child is the middle of a facet and the parent the middle of an edge ``(k,)``.
     """
 
-    config: Configuration
-    nodes: Indices
-    child: Ints
-    parent: Ints
-    weight: Array
-    of_facet: Bools
+    config: Configuration  # configuration of the displacement, of degree 2
+    nodes: Indices  # owned contactor nodes ``(n,)``
+    child: Ints  # index of the term's contactor ``(k,)``
+    parent: Ints  # local node of the term's parent ``(k,)``
+    weight: Array  # weight of each term ``(k,)``
+    of_facet: Bools  # whether the child is the middle of a facet and the parent the middle of an edge ``(k,)``
 
     def control_gaps(self, projection: Projection, usable: Bools) -> ControlGaps:
         """Terms that are valid for the current projection (collective).
@@ -91,23 +83,14 @@ class Family:
 
 @dataclass(frozen=True)
 class ControlGaps:
-    """The terms of a family at one displacement.
+    """The terms of a family at one displacement."""
 
-    Attributes:
-        family: family of the terms.
-        shared: whether the gap is quadratic between the child and all its parents ``(k,)``.
-        gap: of the parents ``(k,)``.
-        normal: of the parents ``(k, gdim)``.
-        targets: global nodes that the parents follow ``(k, nn)``.
-        weights: their weights ``(k, nn)``.
-    """
-
-    family: Family
-    shared: Bools
-    gap: Array
-    normal: Array
-    targets: Ints
-    weights: Array
+    family: Family  # family of the terms
+    shared: Bools  # whether the gap is quadratic between the child and all its parents ``(k,)``
+    gap: Array  # of the parents ``(k,)``
+    normal: Array  # of the parents ``(k, gdim)``
+    targets: Ints  # global nodes that the parents follow ``(k, nn)``
+    weights: Array  # their weights ``(k, nn)``
 
     def of(self, gap: Array) -> Array:
         """Control gaps from nodal gaps ``(n,)``."""
@@ -163,13 +146,9 @@ class Bernstein(NodeToSurface):
 
 @dataclass(frozen=True)
 class ControlKinematics(NodalKinematics):
-    """``NodalKinematics`` with control gaps.
+    """``NodalKinematics`` with control gaps."""
 
-    Attributes:
-        control: terms of the control gaps.
-    """
-
-    control: ControlGaps = field(kw_only=True)
+    control: ControlGaps = field(kw_only=True)  # terms of the control gaps
 
     def weights(self) -> tuple[Ints, Ints, Array]:
         """Weights at the closest points, and of the terms of control gaps."""

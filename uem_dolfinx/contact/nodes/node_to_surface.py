@@ -159,18 +159,12 @@ class NodeToSurface(OnTarget):
 
 @dataclass(frozen=True)
 class NodalKinematics(PlacedOnTarget):
-    """Implements ``Kinematics``: nodes on the surface of one target.
-
-    Attributes:
-        corners: of the target that hold contactors; None if no rank has such a corner.
-        target_moves: whether the target can move along the normal ``(n,)``; None if no contactor is prescribed.
-        out: contactors that are left to other equations ``(n,)``, or None.
-    """
+    """Implements ``Kinematics``: nodes on the surface of one target."""
 
     of: NodeToSurface
-    corners: Corners | None
-    target_moves: Bools | None
-    out: Bools | None = None
+    corners: Corners | None  # of the target that hold contactors; None if no rank has such a corner
+    target_moves: Bools | None  # whether the target can move along the normal ``(n,)``; None if no contactor is prescribed
+    out: Bools | None = None  # contactors that are left to other equations ``(n,)``, or None
 
     @cached_property
     def movable(self) -> Bools:

@@ -25,8 +25,7 @@ from uem_dolfinx.geometry.surfaces import followed_nodes, surface_nodes
 from uem_dolfinx.geometry.tags import as_tag
 from uem_dolfinx.parallel import reduced
 
-#: A contactor that the fluid has reached and left so often in a step keeps it until the step ends.
-#: [bound; changes in a step; -]
+#: A contactor that the fluid has reached and left so often in a step keeps it until the step ends. [bound; changes in a step; -]
 MOST_REACHED = 3
 
 

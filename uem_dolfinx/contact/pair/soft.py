@@ -45,8 +45,7 @@ from uem_dolfinx.parallel import reduced
 #: A gap holds a body that nothing else holds where it has more than this part of its stiffness at rest.
 #: [convention; slope of the law; test_soft_contact.py::test_what_holds_a_body]
 HELD_FROM = 1e-6
-#: Gaps under a pressure are found by so many bisections, and one step of Newton's method.
-#: [bound; bisections; -]
+#: Gaps under a pressure are found by so many bisections, and one step of Newton's method. [bound; bisections; -]
 BISECTIONS = 30
 #: Columns of the state of damping: gap, dissipated energy, and of its last step the gap at its beginning, damping over length, and time.
 GAP, WORK, BEGUN, RATE, AT = range(5)

@@ -39,15 +39,10 @@ PATIENCE = 30
 
 @dataclass(frozen=True)
 class Violations:
-    """Contactors that violate the contact conditions, each ``(n,)``.
+    """Contactors that violate the contact conditions, each ``(n,)``."""
 
-    Attributes:
-        enter: open contactors with negative gap.
-        release: closed contactors in tension, or whose gap can no longer be closed.
-    """
-
-    enter: Bools
-    release: Bools
+    enter: Bools  # open contactors with negative gap
+    release: Bools  # closed contactors in tension, or whose gap can no longer be closed
 
     @classmethod
     def none(cls, n: int) -> Violations:

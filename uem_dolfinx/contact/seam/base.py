@@ -164,21 +164,13 @@ class OnTarget:
 
 @dataclass(frozen=True)
 class PlacedOnTarget:
-    """Implements ``Kinematics`` from ``gap_rows``, ``pressure_map`` and ``ties``, for rows that are equal in every state.
+    """Implements ``Kinematics`` from ``gap_rows``, ``pressure_map`` and ``ties``, for rows that are equal in every state."""
 
-    Attributes:
-        of: discretisation.
-        points: of the contactors ``(n, gdim)``.
-        projection: of the contactors; onto the corner for contactors held by one.
-        nearest: of the contactors, on their nearest facets.
-        gap: deciding gaps ``(n,)``.
-    """
-
-    of: OnTarget
-    points: Array
-    projection: Projection
-    nearest: Projection
-    gap: Array
+    of: OnTarget  # discretisation
+    points: Array  # of the contactors ``(n, gdim)``
+    projection: Projection  # of the contactors; onto the corner for contactors held by one
+    nearest: Projection  # of the contactors, on their nearest facets
+    gap: Array  # deciding gaps ``(n,)``
 
     @property
     def normal(self) -> Array:

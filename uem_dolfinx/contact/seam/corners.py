@@ -10,8 +10,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.geometry.projection import gap_hessians
 
-#: Facets whose slopes differ by less are one plane.
-#: [convention; slope; test_corners.py::test_facets_in_one_plane]
+#: Facets whose slopes differ by less are one plane. [convention; slope; test_corners.py::test_facets_in_one_plane]
 ON_PLANE = 1e-9
 
 
@@ -22,41 +21,23 @@ WEDGED = 0.99
 
 @dataclass(frozen=True)
 class Corners:
-    """Position of contactors relative to an edge or vertex shared by several facets.
+    """Position of contactors relative to an edge or vertex shared by several facets."""
 
-    Attributes:
-        which: indices among the pair's contactors ``(k,)``.
-        count: number of facets, 2 to gdim ``(k,)``.
-        meets: whether the facets share an edge or vertex ``(k,)``.
-        rising: slope at which the last facet rises above the planes of the others, positive if concave ``(k,)``.
-        normals: outward normals of the facets, zero beyond ``count`` ``(k, gdim, gdim)``.
-        away: unit directions along the facets away from the shared edge or vertex, zero beyond ``count`` ``(k, gdim, gdim)``.
-        axes: orthonormal axes; the first ``count`` span the normals, the first is their mean direction ``(k, gdim, gdim)``.
-        nodes: global nodes of the first facet ``(k, nn)``.
-        weights: shape functions at the closest point of the shared edge or vertex ``(k, nn)``.
-        foot: this closest point ``(k, gdim)``; past the target's end it lies on the continuation of the edge.
-        beyond: vector of ``foot`` past the end ``(k, gdim)``.
-        x: positions of the nodes ``(k, nn, gdim)``.
-        dN: derivatives of the weights along the edge, zero at a vertex ``(k, nn, fdim - 1)``.
-        ddN: second derivatives ``(k, nn, fdim - 1, fdim - 1)``.
-        offset: distance from each facet at which contactors are held ``(k,)``; None without offset.
-    """
-
-    which: Ints
-    count: Ints
-    meets: Bools
-    rising: Array
-    normals: Array
-    away: Array
-    axes: Array
-    nodes: Ints
-    weights: Array
-    foot: Array
-    beyond: Array
-    x: Array
-    dN: Array
-    ddN: Array
-    offset: Array | None = None
+    which: Ints  # indices among the pair's contactors ``(k,)``
+    count: Ints  # number of facets, 2 to gdim ``(k,)``
+    meets: Bools  # whether the facets share an edge or vertex ``(k,)``
+    rising: Array  # slope at which the last facet rises above the planes of the others, positive if concave ``(k,)``
+    normals: Array  # outward normals of the facets, zero beyond ``count`` ``(k, gdim, gdim)``
+    away: Array  # unit directions along the facets away from the shared edge or vertex, zero beyond ``count`` ``(k, gdim, gdim)``
+    axes: Array  # orthonormal axes; the first ``count`` span the normals, the first is their mean direction ``(k, gdim, gdim)``
+    nodes: Ints  # global nodes of the first facet ``(k, nn)``
+    weights: Array  # shape functions at the closest point of the shared edge or vertex ``(k, nn)``
+    foot: Array  # this closest point ``(k, gdim)``; past the target's end it lies on the continuation of the edge
+    beyond: Array  # vector of ``foot`` past the end ``(k, gdim)``
+    x: Array  # positions of the nodes ``(k, nn, gdim)``
+    dN: Array  # derivatives of the weights along the edge, zero at a vertex ``(k, nn, fdim - 1)``
+    ddN: Array  # second derivatives ``(k, nn, fdim - 1, fdim - 1)``
+    offset: Array | None = None  # distance from each facet at which contactors are held ``(k,)``; None without offset
 
     @property
     def concave(self) -> Bools:

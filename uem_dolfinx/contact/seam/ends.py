@@ -41,21 +41,16 @@ class Ends:
     ========================================  ====================  =========================================================
 
     ``passed`` is reset for active contactors, and for contactors in front of the target at the end of a step.
-
-    Attributes:
-        projection: onto the nearest facets.
-        thickness: of the target's body, a length.
-        holds: whether an end can hold contactors, for all or for each ``(n,)``; not with mortar, whose covered areas vanish there.
-        share: covered part of each contactor's facets ``(n,)``, negative if irrelevant; None for nodal equations.
-        out: contactors that must not touch the target ``(n,)``, or None.
-        overhanging: finds which of some contactors ``(n,)`` past an end have a facet over the target ``(n,)`` (collective), or None.
     """
 
-    projection: Projection
-    thickness: float
+    projection: Projection  # onto the nearest facets
+    thickness: float  # of the target's body, a length
+    #: whether an end can hold contactors, for all or for each ``(n,)``; not with mortar, whose covered areas vanish there.
     holds: bool | Bools = False
+    #: covered part of each contactor's facets ``(n,)``, negative if irrelevant; None for nodal equations.
     share: Array | None = None
-    out: Bools | None = None
+    out: Bools | None = None  # contactors that must not touch the target ``(n,)``, or None
+    #: finds which of some contactors ``(n,)`` past an end have a facet over the target ``(n,)`` (collective), or None.
     overhanging: Callable[[Bools], Bools] | None = None
 
     def past(self, state: PairState) -> Bools:

@@ -33,22 +33,14 @@ NORMAL = 0
 
 
 class Traction(NamedTuple):
-    """Contact forces of the contactors of an interface.
+    """Contact forces of the contactors of an interface."""
 
-    Attributes:
-        lam: normal force that decides on contact ``(n,)``.
-        nodal: normal force at the node ``(n,)``.
-        force: on the contactor ``(n, gdim)``.
-        tau: friction that belongs to ``lam`` ``(n, gdim)``; None without friction.
-        bond: multipliers of tied contactors' equations ``(n, gdim)``; None without ties.
-        heat: power from contactors to the target by perfect conductance, see ``PairState``; None without such conductances.
-    """
-
-    lam: Array
-    nodal: Array
-    force: Array
-    tau: Array | None = None
-    bond: Array | None = None
+    lam: Array  # normal force that decides on contact ``(n,)``
+    nodal: Array  # normal force at the node ``(n,)``
+    force: Array  # on the contactor ``(n, gdim)``
+    tau: Array | None = None  # friction that belongs to ``lam`` ``(n, gdim)``; None without friction
+    bond: Array | None = None  # multipliers of tied contactors' equations ``(n, gdim)``; None without ties
+    #: power from contactors to the target by perfect conductance, see ``PairState``; None without such conductances.
     heat: Array | None = None
 
     def with_friction(self, tau: Array, ties: Ties, force: Array) -> Traction:
@@ -58,26 +50,20 @@ class Traction(NamedTuple):
 
 @dataclass(frozen=True)
 class ContactRows:
-    """Constraint equations of one interface or of several, each with its contactor. P and Q eliminate the same nodes.
+    """Constraint equations of one interface or of several, each with its contactor. P and Q eliminate the same nodes."""
 
-    Attributes:
-        rows: Q without friction: gradients of the gaps, then directions along the target; active ones are eliminated ``(m,)``.
-        contactor: index of each row's contactor in its interface ``(m,)``; -1 for equations of users.
-        kind: ``NORMAL``, or the number of a corner's further axis; ``-1 - c`` for component c of a permanent equation ``(m,)``.
-        tangent: number of the direction along the target, -1 for all other rows ``(m,)``.
-        moved: rows of P if their weights differ; None if P has the same rows.
-        tilt: what friction adds to the rows of slipping contactors in Q, zero for all others; None if no rank has any.
-        resisted: rows of relative motions that contact and friction resist ``(m,)``; None without friction, for the active ones.
-        crosswise: rows across the slip of slipping contactors in 3D, for bodies that only contact holds; None without such.
-    """
-
+    #: Q without friction: gradients of the gaps, then directions along the target; active ones are eliminated ``(m,)``.
     rows: UnitingEquations
-    contactor: Ints
+    contactor: Ints  # index of each row's contactor in its interface ``(m,)``; -1 for equations of users
+    #: ``NORMAL``, or the number of a corner's further axis; ``-1 - c`` for component c of a permanent equation ``(m,)``.
     kind: Ints
-    tangent: Ints
-    moved: UnitingEquations | None = None
+    tangent: Ints  # number of the direction along the target, -1 for all other rows ``(m,)``
+    moved: UnitingEquations | None = None  # rows of P if their weights differ; None if P has the same rows
+    #: what friction adds to the rows of slipping contactors in Q, zero for all others; None if no rank has any.
     tilt: UnitingEquations | None = None
+    #: rows of relative motions that contact and friction resist ``(m,)``; None without friction, for the active ones.
     resisted: Bools | None = None
+    #: rows across the slip of slipping contactors in 3D, for bodies that only contact holds; None without such.
     crosswise: UnitingEquations | None = None
 
     @classmethod
@@ -160,22 +146,15 @@ class GapRows:
     """Deciding gaps to first order: ``gap_i + scale_i (direction_i . du_i - sum_j C_ij . du_j)`` for every contactor.
 
     Rows along the contact normals come first, one for each contactor in their order; those of further axes of corners follow.
-
-    Attributes:
-        equations: the constraint equations with gaps ``gap / scale``, all inactive ``(m,)``.
-        scale: deciding gaps over the gaps of the equations ``(n,)``.
-        free: components of the contactors without Dirichlet condition ``(n, gdim)``.
-        contactor: of each row ``(m,)``.
-        kind: ``NORMAL``, or the number of a corner's further axis ``(m,)``.
-        moved: rows of P if their weights differ from the weights of the gaps; None if they are equal.
     """
 
     config: Configuration
-    equations: UnitingEquations
-    scale: Array
-    free: Bools
-    contactor: Ints
-    kind: Ints
+    equations: UnitingEquations  # the constraint equations with gaps ``gap / scale``, all inactive ``(m,)``
+    scale: Array  # deciding gaps over the gaps of the equations ``(n,)``
+    free: Bools  # components of the contactors without Dirichlet condition ``(n, gdim)``
+    contactor: Ints  # of each row ``(m,)``
+    kind: Ints  # ``NORMAL``, or the number of a corner's further axis ``(m,)``
+    #: rows of P if their weights differ from the weights of the gaps; None if they are equal.
     moved: UnitingEquations | None = None
 
     @classmethod
@@ -239,17 +218,11 @@ class GapRows:
 
 
 class Along(NamedTuple):
-    """Friction forces whose derivatives are part of the curvature.
+    """Friction forces whose derivatives are part of the curvature."""
 
-    Attributes:
-        which: contactors, ascending; with ``at_feet`` only slipping ones ``(k,)``.
-        tau: their friction, as multipliers of tangential rows ``(k, gdim)``.
-        held: sticking contactors, with constant multipliers instead of a constant coefficient of friction ``(k,)``.
-    """
-
-    which: Ints
-    tau: Array
-    held: Bools
+    which: Ints  # contactors, ascending; with ``at_feet`` only slipping ones ``(k,)``
+    tau: Array  # their friction, as multipliers of tangential rows ``(k, gdim)``
+    held: Bools  # sticking contactors, with constant multipliers instead of a constant coefficient of friction ``(k,)``
 
 
 class Kinematics(Protocol):
@@ -335,46 +308,28 @@ class Kinematics(Protocol):
 
 
 class Traits(NamedTuple):
-    """Properties of a discretisation that no placement changes.
+    """Properties of a discretisation that no placement changes."""
 
-    Attributes:
-        at_feet: whether contact forces act at the closest points of the projection.
-        pointwise: whether each contactor follows the point of the target below it, not a mean.
-        chained: whether contactors may follow each other.
-        two_pass: whether the target may be the contactor of another contact with these surfaces.
-        order: number of the order of bodies that the rows of this and other contacts respect; -1 without an order.
-        sliding: ``"finite"``, ``"small"`` or ``"fixed"``.
-    """
-
-    at_feet: bool
-    pointwise: bool
-    chained: bool
-    two_pass: bool
-    order: int = -1
-    sliding: str = "finite"
+    at_feet: bool  # whether contact forces act at the closest points of the projection
+    pointwise: bool  # whether each contactor follows the point of the target below it, not a mean
+    chained: bool  # whether contactors may follow each other
+    two_pass: bool  # whether the target may be the contactor of another contact with these surfaces
+    order: int = -1  # number of the order of bodies that the rows of this and other contacts respect; -1 without an order
+    sliding: str = "finite"  # ``"finite"``, ``"small"`` or ``"fixed"``
 
 
 class Setting(NamedTuple):
-    """What is set for the contactors of a discretisation, for all placements until a part is set anew.
+    """What is set for the contactors of a discretisation, for all placements until a part is set anew."""
 
-    Attributes:
-        free: components of all owned nodes without Dirichlet condition ``(n_owned, gdim)``.
-        prescribed: whether any contactor on any rank has a Dirichlet condition.
-        far: contacts whose surfaces are separated, so that their contactors are skipped, see ``solve.bodies.far_apart`` ``(n_contacts,)``.
-        on: contacts that are switched on; contactors of others are left out ``(n_contacts,)``.
-        mutual: contacts whose contactors and target follow each other (two-pass) ``(n_contacts,)``.
-        label: number of the contact of each contactor ``(n,)``.
-        offset: heights minus gaps ``(n,)``; None without offset.
-        cones: slopes of the contactors' cones of friction ``(n,)`` at normal forces ``(n,)``; None without friction.
-    """
-
-    free: Bools
-    prescribed: bool
+    free: Bools  # components of all owned nodes without Dirichlet condition ``(n_owned, gdim)``
+    prescribed: bool  # whether any contactor on any rank has a Dirichlet condition
+    #: contacts whose surfaces are separated, so that their contactors are skipped, see ``solve.bodies.far_apart`` ``(n_contacts,)``.
     far: Bools
-    on: Bools
-    mutual: Bools
-    label: Ints
-    offset: Array | None = None
+    on: Bools  # contacts that are switched on; contactors of others are left out ``(n_contacts,)``
+    mutual: Bools  # contacts whose contactors and target follow each other (two-pass) ``(n_contacts,)``
+    label: Ints  # number of the contact of each contactor ``(n,)``
+    offset: Array | None = None  # heights minus gaps ``(n,)``; None without offset
+    #: slopes of the contactors' cones of friction ``(n,)`` at normal forces ``(n,)``; None without friction.
     cones: Callable[[Array], Array] | None = None
 
 

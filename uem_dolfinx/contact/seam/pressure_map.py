@@ -14,20 +14,13 @@ from uem_dolfinx.geometry.configuration import Configuration
 
 
 class Sums(NamedTuple):
-    """A sparse matrix S over the contactors of all ranks.
-
-    Attributes:
-        nodes: owned contactors ``(n,)``.
-        column: index of the contactor of each entry ``(k,)``.
-        row: local node of each entry ``(k,)``.
-        entry: value of each entry ``(k,)``.
-    """
+    """A sparse matrix S over the contactors of all ranks."""
 
     config: Configuration
-    nodes: Indices
-    column: Ints
-    row: Ints
-    entry: Array
+    nodes: Indices  # owned contactors ``(n,)``
+    column: Ints  # index of the contactor of each entry ``(k,)``
+    row: Ints  # local node of each entry ``(k,)``
+    entry: Array  # value of each entry ``(k,)``
 
     def of(self, values: Array) -> Array:
         """``S values`` ``(n,)`` (collective)."""
@@ -40,15 +33,10 @@ class Sums(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """Integrals with the basis of the forces, from integrals with the shape functions: ``B = W (I + S_1) ... (I + S_m)``.
+    """Integrals with the basis of the forces, from integrals with the shape functions: ``B = W (I + S_1) ... (I + S_m)``."""
 
-    Attributes:
-        scale: the diagonal of W ``(n,)``.
-        sums: ``S_1 ... S_m``.
-    """
-
-    scale: Array | float = 1.0
-    sums: tuple[Sums, ...] = ()
+    scale: Array | float = 1.0  # the diagonal of W ``(n,)``
+    sums: tuple[Sums, ...] = ()  # ``S_1 ... S_m``
 
     def of(self, integrals: Array) -> Array:
         """``B integrals`` ``(n,)`` (collective)."""
@@ -66,20 +54,14 @@ class Basis(NamedTuple):
 
 @dataclass(frozen=True)
 class Stretch:
-    """Factor of pressures: a power of nodal sums of facet shares over the same sums in the reference configuration.
-
-    Attributes:
-        nodes: owned contactors ``(n,)``.
-        dofs: local nodes of the facets ``(m, nn)``.
-        shares: function of node positions ``(m, nn, gdim)`` that returns shares ``(m, nn)`` and derivatives ``(m, nn, nn, gdim)``.
-        power: exponents ``(n,)``.
-    """
+    """Factor of pressures: a power of nodal sums of facet shares over the same sums in the reference configuration."""
 
     config: Configuration
-    nodes: Indices
-    dofs: Indices
+    nodes: Indices  # owned contactors ``(n,)``
+    dofs: Indices  # local nodes of the facets ``(m, nn)``
+    #: function of node positions ``(m, nn, gdim)`` that returns shares ``(m, nn)`` and derivatives ``(m, nn, nn, gdim)``.
     shares: Callable[[Array], tuple[Array, Array]]
-    power: Array
+    power: Array  # exponents ``(n,)``
 
     @cached_property
     def _parts(self) -> list[tuple[Array, Array]]:
@@ -113,20 +95,13 @@ class PressureMap(NamedTuple):
     """Pressures ``p = F mu / A``: multipliers mu of normal equations correspond to forces ``lam = F mu`` on areas A.
 
     Areas are ``A = B a`` with integrals a of the shape functions over the contactor, except where they are known.
-
-    Attributes:
-        force: the diagonal of F ``(n,)``; not valid in corners, where several rows contribute to a force.
-        basis: B.
-        known: contactors with known areas ``(n,)``.
-        area: these areas ``(n,)``.
-        stretch: further dependence of pressures on positions at constant multipliers and areas; None without.
     """
 
-    force: Array
-    basis: Basis = Basis()
-    known: Bools | bool = False
-    area: Array | float = 0.0
-    stretch: Stretch | None = None
+    force: Array  # the diagonal of F ``(n,)``; not valid in corners, where several rows contribute to a force
+    basis: Basis = Basis()  # B
+    known: Bools | bool = False  # contactors with known areas ``(n,)``
+    area: Array | float = 0.0  # these areas ``(n,)``
+    stretch: Stretch | None = None  # further dependence of pressures on positions at constant multipliers and areas; None without
 
     def areas(self, integrals: Array) -> Array:
         """Areas A from ``integrals (n,)`` of the shape functions (collective)."""

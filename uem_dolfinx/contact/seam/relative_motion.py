@@ -19,26 +19,16 @@ MOST_HELD = 0.5 + 1e-6
 
 @dataclass(frozen=True)
 class Ties:
-    """Weights by which contactors follow other nodes, and the free components of their relative motion.
-
-    Attributes:
-        nodes: owned contactors ``(n,)``.
-        row: index of the contactor of each term ``(k,)``.
-        followed: global node of each term ``(k,)``.
-        weight: weight of this node ``(k,)``.
-        moves: components of the relative motion not prescribed by Dirichlet conditions ``(n, gdim)``.
-        held: weights for the prescribed components ``(k, gdim)``; None if equal to ``weight``.
-        share: friction over the multipliers of tangential equations ``(n,)``.
-    """
+    """Weights by which contactors follow other nodes, and the free components of their relative motion."""
 
     config: Configuration
-    nodes: Indices
-    row: Ints
-    followed: Ints
-    weight: Array
-    moves: Bools
-    held: Array | None
-    share: Array
+    nodes: Indices  # owned contactors ``(n,)``
+    row: Ints  # index of the contactor of each term ``(k,)``
+    followed: Ints  # global node of each term ``(k,)``
+    weight: Array  # weight of this node ``(k,)``
+    moves: Bools  # components of the relative motion not prescribed by Dirichlet conditions ``(n, gdim)``
+    held: Array | None  # weights for the prescribed components ``(k, gdim)``; None if equal to ``weight``
+    share: Array  # friction over the multipliers of tangential equations ``(n,)``
 
     @classmethod
     def of(
@@ -114,17 +104,11 @@ class Ties:
 
 
 class Terms(NamedTuple):
-    """Terms of linear functions of the unknowns, one function per contactor.
+    """Terms of linear functions of the unknowns, one function per contactor."""
 
-    Attributes:
-        row: index of the contactor ``(k,)``.
-        node: global row of vectors ``(k,)``.
-        vector: coefficients of the components there ``(k, gdim)``.
-    """
-
-    row: Ints
-    node: Ints
-    vector: Array
+    row: Ints  # index of the contactor ``(k,)``
+    node: Ints  # global row of vectors ``(k,)``
+    vector: Array  # coefficients of the components there ``(k, gdim)``
 
 
 def dyads(scale: Array, left: Terms, right: Terms) -> tuple[Ints, Array]:

@@ -25,28 +25,17 @@ class FrictionState:
 
     The anchor is the point of the target to which a contactor sticks. For an open or slipping contactor it is the position at the
     end of the last step; it is constant while the contactor sticks.
-
-    Attributes:
-        stick: whether it sticks to the anchor ``(n,)``.
-        direction: unit vector of the slip direction; zero for other contactors ``(n, gdim)``.
-        tau: friction force that belongs to ``lam`` ``(n, gdim)``.
-        facet: facet of the anchor ``(n,)``; -1 on a rigid target.
-        xi: reference coordinates of the anchor on the facet ``(n, gdim - 1)``.
-        anchor: vector added to this point; on a rigid target the anchor at the target's reference position ``(n, gdim)``.
-        slipped: accumulated slip over all steps ``(n, gdim)``.
-        work: frictional dissipation ``(n,)``.
-        worn: wear depth ``(n,)``.
     """
 
-    stick: Bools
-    direction: Array
-    tau: Array
-    facet: Ints
-    xi: Array
-    anchor: Array
-    slipped: Array
-    work: Array
-    worn: Array
+    stick: Bools  # whether it sticks to the anchor ``(n,)``
+    direction: Array  # unit vector of the slip direction; zero for other contactors ``(n, gdim)``
+    tau: Array  # friction force that belongs to ``lam`` ``(n, gdim)``
+    facet: Ints  # facet of the anchor ``(n,)``; -1 on a rigid target
+    xi: Array  # reference coordinates of the anchor on the facet ``(n, gdim - 1)``
+    anchor: Array  # vector added to this point; on a rigid target the anchor at the target's reference position ``(n, gdim)``
+    slipped: Array  # accumulated slip over all steps ``(n, gdim)``
+    work: Array  # frictional dissipation ``(n,)``
+    worn: Array  # wear depth ``(n,)``
 
     @classmethod
     def initial(cls, n: int, gdim: int) -> FrictionState:
@@ -66,56 +55,40 @@ class FrictionState:
 
 @dataclass(frozen=True)
 class PairState:
-    """State of ``n`` contactors; immutable, so that trial and committed states may share arrays.
+    """State of ``n`` contactors; immutable, so that trial and committed states may share arrays."""
 
-    Attributes:
-        reserved: whether it has rows in the sparsity of P ``(n,)``.
-        redundant: whether its equation depends on others and was left out ``(n,)``.
-        active: whether the contact equation is active ``(n,)``.
-        lam: normal contact force, positive in compression ``(n,)``; on a degree-2 surface the control force.
-        nodal: normal contact force at the node ``(n,)``; equal to ``lam`` on a degree-1 surface.
-        force: contact force on the contactor ``(n, gdim)``.
-        facet: target facet of the contactor ``(n,)``, -1 before the first projection.
-        held: further facets of a contactor held in a concave corner of the target, or -1 ``(n, gdim - 1)``.
-        changes: number of changes of facet across an edge in this step ``(n,)``.
-        passed: whether it has been past the target's end since it was last in front of it ``(n,)``.
-        at_end: whether an end has held it since first touch, or it slid off the end in this step; such contactors do not alternate
-            between release and activation ``(n,)``.
-        barred: whether it re-entered the target from past its end while penetrating; ignored until it is in front again ``(n,)``.
-        cover: for mortar only: bits of its facets that a rigid target covers, or on which a mesh leaves it a dual function, in an
-            order independent of the partition ``(n,)``.
-        friction: friction variables; None without friction.
-        bond: multipliers of the equations of tied contactors ``(n, gdim)``; None without ties.
-        heat: power from contactors to the target by perfect conductance, one column per field ``(n, n_perfect)``; None without such
-            conductances.
-        law_gap: gaps at which the law of a soft contact gives the forces, infinity for the present gaps ``(n,)``; None for hard contact,
-            and while it is switched off.
-        cohesion: damage, delayed damage, load factor or time of these, permanent opening and normal of bonds ``(n, 3 + 2 gdim)``; None
-            without cohesion.
-        damping: gap, dissipated energy, and of the last step the gap at its beginning, damping over length, and time ``(n, 5)``; None
-            without damping.
-        wet: whether a fluid between the surfaces reaches the contactor ``(n,)``; None without fluid.
-    """
-
-    reserved: Bools
-    redundant: Bools
-    active: Bools
-    lam: Array
-    nodal: Array
-    force: Array
-    facet: Ints
-    held: Ints
-    changes: Ints
-    passed: Bools
+    reserved: Bools  # whether it has rows in the sparsity of P ``(n,)``
+    redundant: Bools  # whether its equation depends on others and was left out ``(n,)``
+    active: Bools  # whether the contact equation is active ``(n,)``
+    lam: Array  # normal contact force, positive in compression ``(n,)``; on a degree-2 surface the control force
+    nodal: Array  # normal contact force at the node ``(n,)``; equal to ``lam`` on a degree-1 surface
+    force: Array  # contact force on the contactor ``(n, gdim)``
+    facet: Ints  # target facet of the contactor ``(n,)``, -1 before the first projection
+    held: Ints  # further facets of a contactor held in a concave corner of the target, or -1 ``(n, gdim - 1)``
+    changes: Ints  # number of changes of facet across an edge in this step ``(n,)``
+    passed: Bools  # whether it has been past the target's end since it was last in front of it ``(n,)``
+    #: whether an end has held it since first touch, or it slid off the end in this step; such contactors do not alternate
+    #: between release and activation ``(n,)``.
     at_end: Bools
+    #: whether it re-entered the target from past its end while penetrating; ignored until it is in front again ``(n,)``.
     barred: Bools
+    #: for mortar only: bits of its facets that a rigid target covers, or on which a mesh leaves it a dual function, in an
+    #: order independent of the partition ``(n,)``.
     cover: Ints
-    friction: FrictionState | None = None
-    bond: Array | None = None
+    friction: FrictionState | None = None  # friction variables; None without friction
+    bond: Array | None = None  # multipliers of the equations of tied contactors ``(n, gdim)``; None without ties
+    #: power from contactors to the target by perfect conductance, one column per field ``(n, n_perfect)``; None without such
+    #: conductances.
     heat: Array | None = None
+    #: gaps at which the law of a soft contact gives the forces, infinity for the present gaps ``(n,)``; None for hard contact,
+    #: and while it is switched off.
     law_gap: Array | None = None
+    #: damage, delayed damage, load factor or time of these, permanent opening and normal of bonds ``(n, 3 + 2 gdim)``; None
+    #: without cohesion.
     cohesion: Array | None = None
-    wet: Bools | None = None
+    wet: Bools | None = None  # whether a fluid between the surfaces reaches the contactor ``(n,)``; None without fluid
+    #: gap, dissipated energy, and of the last step the gap at its beginning, damping over length, and time ``(n, 5)``; None
+    #: without damping.
     damping: Array | None = None
 
     @property

@@ -92,17 +92,11 @@ class Declared(Protocol):
 
 @dataclass(frozen=True)
 class Passage(Sides):
-    """Heat flow of one placement: the nodes opposite to contactors, and areas.
+    """Heat flow of one placement: the nodes opposite to contactors, and areas."""
 
-    Attributes:
-        areas: areas for heat flow ``(n,)``.
-        force: contact forces over multipliers, see ``PressureMap`` ``(n,)``.
-        leads: contactors that conduct heat when they touch ``(n,)``.
-    """
-
-    areas: Array
-    force: Array
-    leads: Bools
+    areas: Array  # areas for heat flow ``(n,)``
+    force: Array  # contact forces over multipliers, see ``PressureMap`` ``(n,)``
+    leads: Bools  # contactors that conduct heat when they touch ``(n,)``
 
     @property
     def jump(self) -> Array:
@@ -111,17 +105,11 @@ class Passage(Sides):
 
 
 class HeatEquations(NamedTuple):
-    """Constraint equations of temperatures.
+    """Constraint equations of temperatures."""
 
-    Attributes:
-        rows: the equations ``(m,)``.
-        which: indices of their contactors ``(m,)``.
-        own: divisor of each equation, the weight of the contactor's own unknown in its mean ``(m,)``.
-    """
-
-    rows: UnitingEquations
-    which: Ints
-    own: Array
+    rows: UnitingEquations  # the equations ``(m,)``
+    which: Ints  # indices of their contactors ``(m,)``
+    own: Array  # divisor of each equation, the weight of the contactor's own unknown in its mean ``(m,)``
 
 
 class Heat:

@@ -26,22 +26,14 @@ class Placed(Protocol):
 
 @dataclass(frozen=True)
 class Sides:
-    """Both sides of contactors at one placement.
-
-    Attributes:
-        halo: of the nodes in all terms.
-        node: global node of each term ``(k,)``.
-        row: index of the contactor of each term ``(k,)``.
-        own: weights of the contactor's mean, zero in terms of the target ``(k,)``.
-        theirs: weights of the target's mean ``(k,)``.
-    """
+    """Both sides of contactors at one placement."""
 
     projection: Projection
-    halo: Halo
-    node: Ints
-    row: Ints
-    own: Array
-    theirs: Array
+    halo: Halo  # of the nodes in all terms
+    node: Ints  # global node of each term ``(k,)``
+    row: Ints  # index of the contactor of each term ``(k,)``
+    own: Array  # weights of the contactor's mean, zero in terms of the target ``(k,)``
+    theirs: Array  # weights of the target's mean ``(k,)``
 
     def sum(self, terms: Array) -> Array:
         """Sum of each contactor's terms ``(k,)``: ``(n,)``."""

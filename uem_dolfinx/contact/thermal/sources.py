@@ -14,8 +14,7 @@ from uem_dolfinx.contact.seam.active_set import GAP_ROUNDING
 from uem_dolfinx.contact.seam.relative_motion import Terms
 from uem_dolfinx.errors import InputError
 
-#: Durations of a step that differ by less are one.
-#: [bound; length of the step; -]
+#: Durations of a step that differ by less are one. [bound; length of the step; -]
 SAME_DURATION = 1e-6
 
 

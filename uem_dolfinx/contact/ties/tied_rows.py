@@ -41,23 +41,14 @@ from uem_dolfinx.parallel import reduced
 
 @dataclass(frozen=True)
 class Spacers:
-    """Positions of contactors with a gap, which rotates with the target.
+    """Positions of contactors with a gap, which rotates with the target."""
 
-    Attributes:
-        contactor: global nodes with a part in each position ``(p, k)``.
-        weight: their weights in each component ``(p, k, gdim)``.
-        followed: global nodes of the facet below ``(p, nt)``.
-        dN: derivatives of their shape functions at the closest point ``(p, nt, fdim)``.
-        height: height along the facet's normal ``(p,)``.
-        y: positions of the facet's nodes at the time of tying ``(p, nt, gdim)``.
-    """
-
-    contactor: Ints
-    weight: Array
-    followed: Ints
-    dN: Array
-    height: Array
-    y: Array
+    contactor: Ints  # global nodes with a part in each position ``(p, k)``
+    weight: Array  # their weights in each component ``(p, k, gdim)``
+    followed: Ints  # global nodes of the facet below ``(p, nt)``
+    dN: Array  # derivatives of their shape functions at the closest point ``(p, nt, fdim)``
+    height: Array  # height along the facet's normal ``(p,)``
+    y: Array  # positions of the facet's nodes at the time of tying ``(p, nt, gdim)``
 
     def take(self, which: Bools) -> Spacers:
         """A subset of the spacers."""
@@ -106,31 +97,20 @@ class Spacers:
 
 @dataclass(frozen=True)
 class TiedRows:
-    """Equations of tied contactors.
+    """Equations of tied contactors."""
 
-    Attributes:
-        elimination: assembly of rows.
-        has: components in which contactors have an equation ``(n, gdim)``.
-        own: divisors of these equations ``(n, gdim)``.
-        side: parts of these divisors from the facets on the contactor's own side of a seam ``(n, gdim)``; None for nodal equations.
-        share: forces over multipliers ``(n, gdim)``; with mortar multipliers are mean tractions, otherwise nodal forces and share is 1.
-        area: reference areas for these forces ``(n,)``; None for nodal forces.
-        terms: contactors, global nodes and weights by which they follow ``(k,)``, ``(k,)``, ``(k, gdim)``.
-        spacers: positions with kept gaps; None if no rank has a gap.
-        held: tied positions on a rigid target in its reference position ``(n, gdim)``; None on a mesh.
-        kept: whether normals are constant, as with small and fixed sliding.
-    """
-
-    elimination: Elimination
-    has: Bools
-    own: Array
+    elimination: Elimination  # assembly of rows
+    has: Bools  # components in which contactors have an equation ``(n, gdim)``
+    own: Array  # divisors of these equations ``(n, gdim)``
+    #: parts of these divisors from the facets on the contactor's own side of a seam ``(n, gdim)``; None for nodal equations.
     side: Array | None
+    #: forces over multipliers ``(n, gdim)``; with mortar multipliers are mean tractions, otherwise nodal forces and share is 1.
     share: Array
-    area: Array | None
-    terms: Terms
-    spacers: Spacers | None
-    held: Array | None
-    kept: bool
+    area: Array | None  # reference areas for these forces ``(n,)``; None for nodal forces
+    terms: Terms  # contactors, global nodes and weights by which they follow ``(k,)``, ``(k,)``, ``(k, gdim)``
+    spacers: Spacers | None  # positions with kept gaps; None if no rank has a gap
+    held: Array | None  # tied positions on a rigid target in its reference position ``(n, gdim)``; None on a mesh
+    kept: bool  # whether normals are constant, as with small and fixed sliding
 
     @property
     def config(self) -> Configuration:

@@ -28,8 +28,7 @@ from uem_dolfinx.parallel import reduced
 #: A warning is given if so much of the volume that confined bodies should lose is room between their surfaces.
 #: [convention; volume to be lost; test_confined.py::test_bodies_that_give_way]
 ROOM = 3e-3
-#: Surfaces whose areas differ by less than this part cover each other.
-#: [bound; area of the target; -]
+#: Surfaces whose areas differ by less than this part cover each other. [bound; area of the target; -]
 COVERED = 0.02
 #: A support does not move along a normal of which no more than this part, squared, is along free components.
 #: [bound; a unit vector; -]

@@ -16,19 +16,12 @@ from uem_dolfinx.log import logger
 
 @dataclass(frozen=True)
 class Meeting:
-    """Two surfaces whose edges may cross.
+    """Two surfaces whose edges may cross."""
 
-    Attributes:
-        own: the first surface.
-        theirs: the second surface, or the same.
-        apart: sets of facets that never touch each other, for the joint surface of many bodies.
-        itself: bodies that may touch themselves ``(n_bodies,)``, for such a surface; None for two surfaces.
-    """
-
-    own: TargetFacets
-    theirs: TargetFacets
-    apart: Sequence[Apart] = ()
-    itself: Bools | None = None
+    own: TargetFacets  # the first surface
+    theirs: TargetFacets  # the second surface, or the same
+    apart: Sequence[Apart] = ()  # sets of facets that never touch each other, for the joint surface of many bodies
+    itself: Bools | None = None  # bodies that may touch themselves ``(n_bodies,)``, for such a surface; None for two surfaces
 
 
 class EdgesInside:

@@ -48,23 +48,15 @@ EQUALLY_DEEP = 1e-6
 
 @dataclass(frozen=True)
 class CornerInside:
-    """Corners of a target that penetrate the contactors' surface.
+    """Corners of a target that penetrate the contactors' surface."""
 
-    Attributes:
-        place: reference position of the corner that is deepest relative to its facet, as text.
-        depth: of this corner, a length.
-        part: depth over the size of the facet.
-        lacking: missing force of all corners over the largest contact force so far.
-        both: whether contactors at corners or ends of their own surface are in contact, too; swapping the surfaces is then no remedy.
-        round: whether they are vertices of a round target, which ``corners = True`` does not hold.
-    """
-
-    place: str
-    depth: float
-    part: float
-    lacking: float
+    place: str  # reference position of the corner that is deepest relative to its facet, as text
+    depth: float  # of this corner, a length
+    part: float  # depth over the size of the facet
+    lacking: float  # missing force of all corners over the largest contact force so far
+    #: whether contactors at corners or ends of their own surface are in contact, too; swapping the surfaces is then no remedy.
     both: bool = False
-    round: bool = False
+    round: bool = False  # whether they are vertices of a round target, which ``corners = True`` does not hold
 
     def __str__(self) -> str:
         remedy = "take corners = True, or take coupling = 'mortar', as the contactor has corners in contact, too"

@@ -22,8 +22,7 @@ from uem_dolfinx.errors import InvertedElementError, MassError, StepAccuracyErro
 from uem_dolfinx.parallel import gathered, reduced
 
 #: Products with the stiffness of one estimate: Ritz values and the size of their residuals then bound the highest frequency to a few per
-#: cent, less than the safety of steps takes off.
-#: [bound; products; -]
+#: cent, less than the safety of steps takes off. [bound; products; -]
 PRODUCTS = 20
 
 
@@ -78,8 +77,7 @@ STEADY_STRAIN = 0.1
 #: A run ends where the least height of all cells falls below this part of the mesh's least one: cells collapse, and steps with them.
 #: [convention; the least height; test_explicit_materials.py::test_cells_that_collapse]
 COLLAPSED = 1e-3
-#: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from.
-#: [format; wave numbers; -]
+#: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from. [format; wave numbers; -]
 IRRATIONAL = 1e3 * np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
 
 

@@ -25,19 +25,12 @@ FACETS_AWAY = 1.0
 
 
 class Boxes(NamedTuple):
-    """Distances between bounding boxes of surfaces, in one configuration; lengths.
+    """Distances between bounding boxes of surfaces, in one configuration; lengths."""
 
-    Attributes:
-        between: along every axis, in both directions, for meshed targets ``(n_meshed, 2 gdim)``.
-        middle: of the boxes around the contactors of rigid targets ``(n_rigid, gdim)``.
-        radius: half of their diagonals ``(n_rigid,)``.
-        distance: of their middles from the targets ``(n_rigid,)``.
-    """
-
-    between: Array
-    middle: Array
-    radius: Array
-    distance: Array
+    between: Array  # along every axis, in both directions, for meshed targets ``(n_meshed, 2 gdim)``
+    middle: Array  # of the boxes around the contactors of rigid targets ``(n_rigid, gdim)``
+    radius: Array  # half of their diagonals ``(n_rigid,)``
+    distance: Array  # of their middles from the targets ``(n_rigid,)``
 
     @property
     def apart(self) -> Array:

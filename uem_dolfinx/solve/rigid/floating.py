@@ -45,25 +45,17 @@ LIGHT = 1e-3
 #: A body that contact has pushed, and holds no more, has gone no farther than so many times the way of all else, deformations included.
 #: [heuristic; largest displacement in the step; test_unheld.py::test_a_body_that_is_thrown_out]
 THROWN = 10.0
-#: A body that falls comes to rest in so many steps at most.
-#: [bound; steps; -]
+#: A body that falls comes to rest in so many steps at most. [bound; steps; -]
 MOST_RIGID_STEPS = 200
 
 
 class _Held(NamedTuple):
-    """Equations that hold bodies.
+    """Equations that hold bodies."""
 
-    Attributes:
-        rows: equations of contactors that follow their target, and of users.
-        rates: how fast each motion opens their gaps, a sparse matrix ``(m, n_motions)``.
-        which: mask of rows that cannot separate again: with friction, of ties and of users ``(m,)``.
-        basis: motions that these rows leave open ``(n_motions, k)``.
-    """
-
-    rows: UnitingEquations
-    rates: Any
-    which: Bools
-    basis: Any
+    rows: UnitingEquations  # equations of contactors that follow their target, and of users
+    rates: Any  # how fast each motion opens their gaps, a sparse matrix ``(m, n_motions)``
+    which: Bools  # mask of rows that cannot separate again: with friction, of ties and of users ``(m,)``
+    basis: Any  # motions that these rows leave open ``(n_motions, k)``
 
 
 class FloatingBodies:

@@ -25,14 +25,12 @@ from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
-#: All loads move a body against the first drag by this part of its radius.
-#: [bound; radius; -]
+#: All loads move a body against the first drag by this part of its radius. [bound; radius; -]
 FIRST_WAY = 0.3
 #: The drag of the next step over that of the last one; after a failed step it grows by as much.
 #: [convention; drag; test_rest_by_drag.py::test_a_block_rests_in_a_polygonal_bowl]
 DECAY = 0.3
-#: Steps in all, and steps that fail among them.
-#: [bound; steps; -]
+#: Steps in all, and steps that fail among them. [bound; steps; -]
 MOST_DRAGGED, MOST_FAILED = 40, 6
 
 

@@ -36,52 +36,31 @@ MOST_SLOT_SOLVES, STEPS_OF_A_START, FAILED_SEARCHES, HALVINGS_OF_A_STEP = 300, 6
 
 @dataclass(frozen=True)
 class SlotProblem:
-    """``force = stiffness @ w + load`` in k slots of n contactors, and the laws of contact and friction.
+    """``force = stiffness @ w + load`` in k slots of n contactors, and the laws of contact and friction."""
 
-    Attributes:
-        stiffness: ``(k, k)``, may be unsymmetric.
-        load: forces at w = 0 ``(k,)``.
-        normal: slot of the gap of each contactor ``(n,)``.
-        tangents: slots along the target, -1 for prescribed directions ``(n, gdim - 1)``.
-        gap: at w = 0 ``(n,)``.
-        slip: of the step at w = 0, zero in prescribed directions ``(n, gdim - 1)``.
-        slope: limit of friction over the normal force ``(n,)``.
-        rest: limit of friction of an active contactor at zero normal force ``(n,)``.
-    """
-
-    stiffness: Array
-    load: Array
-    normal: Ints
-    tangents: Ints
-    gap: Array
-    slip: Array
-    slope: Array
-    rest: Array
+    stiffness: Array  # ``(k, k)``, may be unsymmetric
+    load: Array  # forces at w = 0 ``(k,)``
+    normal: Ints  # slot of the gap of each contactor ``(n,)``
+    tangents: Ints  # slots along the target, -1 for prescribed directions ``(n, gdim - 1)``
+    gap: Array  # at w = 0 ``(n,)``
+    slip: Array  # of the step at w = 0, zero in prescribed directions ``(n, gdim - 1)``
+    slope: Array  # limit of friction over the normal force ``(n,)``
+    rest: Array  # limit of friction of an active contactor at zero normal force ``(n,)``
 
 
 @dataclass(frozen=True)
 class SlotState:
-    """A solution of a ``SlotProblem``.
+    """A solution of a ``SlotProblem``."""
 
-    Attributes:
-        active: closed contactors ``(n,)``.
-        stick: active contactors with friction that stick ``(n,)``.
-        direction: of slip, without slip opposite to the friction force, of the other active contactors with friction ``(n, gdim - 1)``.
-        w: relative motions ``(k,)``.
-        force: in the slots ``(k,)``.
-        solves: number of dense solves.
-        negative: whether the matrix of the slots that are not held has a negative determinant.
-        indefinite: whether it is symmetric, and has negative eigenvalues.
-    """
-
-    active: Bools
-    stick: Bools
+    active: Bools  # closed contactors ``(n,)``
+    stick: Bools  # active contactors with friction that stick ``(n,)``
+    #: of slip, without slip opposite to the friction force, of the other active contactors with friction ``(n, gdim - 1)``.
     direction: Array
-    w: Array
-    force: Array
-    solves: int
-    negative: bool
-    indefinite: bool
+    w: Array  # relative motions ``(k,)``
+    force: Array  # in the slots ``(k,)``
+    solves: int  # number of dense solves
+    negative: bool  # whether the matrix of the slots that are not held has a negative determinant
+    indefinite: bool  # whether it is symmetric, and has negative eigenvalues
 
 
 @dataclass(frozen=True)

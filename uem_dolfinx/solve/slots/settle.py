@@ -36,31 +36,21 @@ from uem_dolfinx.solve.slots import coulomb
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
 
-#: A dense problem of so many slots takes 200 MB; beyond, one active set after the other is solved.
-#: [bound; slots; -]
+#: A dense problem of so many slots takes 200 MB; beyond, one active set after the other is solved. [bound; slots; -]
 MOST_SLOTS = 5_000
-#: A condensation that does not serve other coordinates within so many passes is made anew.
-#: [bound; passes; -]
+#: A condensation that does not serve other coordinates within so many passes is made anew. [bound; passes; -]
 MOST_PASSES = 6
 
 
 @dataclass(frozen=True)
 class _Slots:
-    """Slots of the contactors of one pair.
+    """Slots of the contactors of one pair."""
 
-    Attributes:
-        pair: with its contactors.
-        contactor: those with slots ``(k,)``.
-        normal: number of the row along each one's normal, of all rows ``(k,)``.
-        tangents: numbers of the rows along the target, -1 for none ``(k, gdim - 1)``.
-        directions: of these rows, zero for none ``(k, gdim - 1, gdim)``.
-    """
-
-    pair: Interface
-    contactor: Ints
-    normal: Ints
-    tangents: Ints
-    directions: Array
+    pair: Interface  # with its contactors
+    contactor: Ints  # those with slots ``(k,)``
+    normal: Ints  # number of the row along each one's normal, of all rows ``(k,)``
+    tangents: Ints  # numbers of the rows along the target, -1 for none ``(k, gdim - 1)``
+    directions: Array  # of these rows, zero for none ``(k, gdim - 1, gdim)``
 
     @classmethod
     def of(cls, pair: Interface, own: ContactRows, first: int, near: Bools) -> _Slots:

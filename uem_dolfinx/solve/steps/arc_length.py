@@ -34,8 +34,7 @@ from uem_dolfinx.solve.united.system import BodySystem
 #: Difference of load factors over which the residual's derivative is taken; exact where the load is proportional to the factor.
 #: [convention; load factor; test_arc_length.py::test_loads_that_are_not_proportional]
 DIFFERENCE = 1e-4
-#: The arc has its length to this part of it.
-#: [convention; arc length; test_arc_length.py::test_length_of_the_arc]
+#: The arc has its length to this part of it. [convention; arc length; test_arc_length.py::test_length_of_the_arc]
 ON_THE_PLANE = 1e-8
 #: A path that has not come to the full load after so many times the nominal number of steps is given up.
 #: [bound; nominal number of steps; test_arc_length.py::test_path_without_end]

@@ -28,15 +28,10 @@ LOOKS = 4
 
 @dataclass(frozen=True)
 class Reached:
-    """What a step leads to at this rank's nodes.
+    """What a step leads to at this rank's nodes."""
 
-    Attributes:
-        u: displacements ``(n_owned, gdim)``.
-        forces: forces of contacts and supports, which the bodies' residual leaves ``(n_owned, gdim)``.
-    """
-
-    u: Array
-    forces: Array
+    u: Array  # displacements ``(n_owned, gdim)``
+    forces: Array  # forces of contacts and supports, which the bodies' residual leaves ``(n_owned, gdim)``
 
     @classmethod
     def of(cls, problem: UnitedProblem) -> Reached:

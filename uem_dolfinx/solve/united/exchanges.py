@@ -55,8 +55,7 @@ NO_LESS = 0.9
 #: Curvature of contact that could make the tangent indefinite is left out until so much of the residual is left.
 #: [convention; norm of the residual; test_exchanges.py::test_convex_until_it_gets_better]
 WHOLE_AGAIN = 0.1
-#: States of a step may come again so often.
-#: [convention; rounds; test_exchanges.py::test_states_that_come_again]
+#: States of a step may come again so often. [convention; rounds; test_exchanges.py::test_states_that_come_again]
 MOST_ROUNDS = 6
 #: A state that has come again so often although no contactor changes gets a convex tangent the next time.
 #: [convention; iterations; test_exchanges.py::test_convex_until_it_gets_better]

@@ -26,11 +26,9 @@ from uem_dolfinx.solve.rigid.unheld import no_precision, unheld
 #: A residual that keeps this part of its norm twice has met its rounding.
 #: [heuristic; norm of the residual; test_trust.py::test_converged_means_converged]
 STALLED = 0.5
-#: Shortest step of the line search.
-#: [bound; halvings of a step; -]
+#: Shortest step of the line search. [bound; halvings of a step; -]
 SHORTEST_SEARCH = 1.0 / 64
-#: Longest step where forces drive the bodies on.
-#: [bound; doublings of a step; -]
+#: Longest step where forces drive the bodies on. [bound; doublings of a step; -]
 LONGEST_SEARCH = 64.0
 #: The line search accepts a step that leaves less than this part of the residual's work or of its norm.
 #: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
@@ -52,102 +50,58 @@ InEquilibrium = Callable[[Norm, Norm, Norm], bool]
 
 @dataclass(frozen=True)
 class Iteration:
-    """One line of the history.
+    """One line of the history."""
 
-    Attributes:
-        residual: norm of ``Q'r`` over the forces at work.
-        gap: largest gap of an active contactor, a length.
-        active: number of active contactors over all ranks in the step that the bodies took.
-        changed: whether contactors were activated or released, or entered or left a corner.
-        linear_iterations: of the solves that followed; 0 if the step had converged.
-        step_length: of the line search in the step to this iteration.
-        exchanges: further solves with the same tangent, each with another active set.
-    """
-
-    residual: float
-    gap: float
-    active: int
-    changed: bool
-    linear_iterations: int
-    step_length: float
-    exchanges: int = 0
+    residual: float  # norm of ``Q'r`` over the forces at work
+    gap: float  # largest gap of an active contactor, a length
+    active: int  # number of active contactors over all ranks in the step that the bodies took
+    changed: bool  # whether contactors were activated or released, or entered or left a corner
+    linear_iterations: int  # of the solves that followed; 0 if the step had converged
+    step_length: float  # of the line search in the step to this iteration
+    exchanges: int = 0  # further solves with the same tangent, each with another active set
 
 
 @dataclass(frozen=True)
 class IterationState:
-    """A state of the united system as the loop sees it.
+    """A state of the united system as the loop sees it."""
 
-    Attributes:
-        trial: P and c, by which the bodies move.
-        test: Q, which transfers forces; the same object as P unless trial and test rows of a coupling differ.
-        residual: ``Q'F``, the out-of-balance forces.
-        norm: its norm.
-        scale: norm of the forces at work.
-        rounding: norm below which a force is rounding of the displacement.
-        gap: largest gap of an active contactor, a length.
-        active: number of active contactors over all ranks.
-        changed: whether contactors have changed their constraints because of their positions.
-        right: whether all contactors satisfy the contact conditions with the present forces.
-        closed: whether gaps and Dirichlet conditions are met.
-        in_contact: whether there are contacts at all.
-    """
-
-    trial: Restriction
-    test: Restriction
-    residual: PETSc.Vec
-    norm: Norm
-    scale: Norm
-    rounding: Norm
-    gap: float
-    active: int
-    changed: bool
-    right: bool
-    closed: bool
-    in_contact: bool
+    trial: Restriction  # P and c, by which the bodies move
+    test: Restriction  # Q, which transfers forces; the same object as P unless trial and test rows of a coupling differ
+    residual: PETSc.Vec  # ``Q'F``, the out-of-balance forces
+    norm: Norm  # its norm
+    scale: Norm  # norm of the forces at work
+    rounding: Norm  # norm below which a force is rounding of the displacement
+    gap: float  # largest gap of an active contactor, a length
+    active: int  # number of active contactors over all ranks
+    changed: bool  # whether contactors have changed their constraints because of their positions
+    right: bool  # whether all contactors satisfy the contact conditions with the present forces
+    closed: bool  # whether gaps and Dirichlet conditions are met
+    in_contact: bool  # whether there are contacts at all
 
 
 class LinearisedProblem(NamedTuple):
-    """``Q'KP dq = rhs`` for one active set, and how it is solved.
+    """``Q'KP dq = rhs`` for one active set, and how it is solved."""
 
-    Attributes:
-        state: with P and Q.
-        rhs: right-hand side ``Q'(r - K c)``.
-        exact: whether solves must be accurate to rounding, since no further iteration corrects them.
-        iterative: whether solves stop at their tolerance, and can start from the solution of another active set.
-        passing: whether another iteration follows in any case.
-        fits: whether a full step needs no line search.
-        convex: whether terms that could make the tangent indefinite are neglected, so that the line search may also lengthen steps.
-        softens: whether forces may grow on the way down, so that the line search takes steps that forces drive on.
-    """
-
-    state: IterationState
-    rhs: PETSc.Vec
-    exact: bool
-    iterative: bool
-    passing: bool
-    fits: bool
+    state: IterationState  # with P and Q
+    rhs: PETSc.Vec  # right-hand side ``Q'(r - K c)``
+    exact: bool  # whether solves must be accurate to rounding, since no further iteration corrects them
+    iterative: bool  # whether solves stop at their tolerance, and can start from the solution of another active set
+    passing: bool  # whether another iteration follows in any case
+    fits: bool  # whether a full step needs no line search
+    #: whether terms that could make the tangent indefinite are neglected, so that the line search may also lengthen steps.
     convex: bool
-    softens: bool = False
+    softens: bool = False  # whether forces may grow on the way down, so that the line search takes steps that forces drive on
 
 
 class Increment(NamedTuple):
-    """Solution of a linearised problem.
+    """Solution of a linearised problem."""
 
-    Attributes:
-        dq: unknowns.
-        du: ``P dq + c``.
-        rhs: right-hand side of dq; methods that control the load, such as arc length, add to it.
-        linear_iterations: number of linear iterations.
-        left: tolerance, relative to the right-hand side.
-        longest: upper bound of the step length; 1 unless the method sets it.
-    """
-
-    dq: PETSc.Vec
-    du: PETSc.Vec
-    rhs: PETSc.Vec
-    linear_iterations: int
-    left: float
-    longest: float = 1.0
+    dq: PETSc.Vec  # unknowns
+    du: PETSc.Vec  # ``P dq + c``
+    rhs: PETSc.Vec  # right-hand side of dq; methods that control the load, such as arc length, add to it
+    linear_iterations: int  # number of linear iterations
+    left: float  # tolerance, relative to the right-hand side
+    longest: float = 1.0  # upper bound of the step length; 1 unless the method sets it
 
 
 class ContactMethod(Protocol):

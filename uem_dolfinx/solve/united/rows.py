@@ -151,27 +151,16 @@ class OverConstraints:
 
 @dataclass(frozen=True)
 class Rows:
-    """Constraint equations of all pairs in one state, with P and Q.
+    """Constraint equations of all pairs in one state, with P and Q."""
 
-    Attributes:
-        pairs: with equations.
-        equations: of each pair.
-        whole: those of all pairs together, then of temperatures and of users.
-        independent: resolution of conflicts; None if there cannot be any.
-        test: Q.
-        frictionless: Q without the friction of slipping contactors; it also closes the gaps.
-        heat: equations of temperatures by number of their pair, each of one field.
-        rigid: rigid couplings, whose equations come last, or None.
-    """
-
-    pairs: Sequence[Interface]
-    equations: list[ContactRows]
-    whole: ContactRows
-    independent: IndependentEquations | None
-    test: Restriction
-    frictionless: Restriction
-    heat: dict[int, list[HeatEquations]]
-    rigid: UserRows | None = None
+    pairs: Sequence[Interface]  # with equations
+    equations: list[ContactRows]  # of each pair
+    whole: ContactRows  # those of all pairs together, then of temperatures and of users
+    independent: IndependentEquations | None  # resolution of conflicts; None if there cannot be any
+    test: Restriction  # Q
+    frictionless: Restriction  # Q without the friction of slipping contactors; it also closes the gaps
+    heat: dict[int, list[HeatEquations]]  # equations of temperatures by number of their pair, each of one field
+    rigid: UserRows | None = None  # rigid couplings, whose equations come last, or None
 
     @property
     def conflict(self) -> bool:
