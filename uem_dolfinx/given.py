@@ -270,8 +270,7 @@ class Sealed:
 
     SETTABLE: ClassVar[Mapping[str, Callable[[Any], Any] | None]] = {}
     _made = False
-    #: Arguments as given, where attributes of these names hold something else, for ``repr``.
-    _told: Mapping[str, Any] = {}
+    _told: Mapping[str, Any] = {}  # arguments as given, where attributes of these names hold something else, for ``repr``
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Seal an object at the end of its outermost ``__init__``."""

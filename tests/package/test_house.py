@@ -119,7 +119,7 @@ def test_imports_point_one_way():
 #: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
 BUDGETS = {
     "members of the seam": 26, "members of Interface": 49, "heuristics": 12, "arrows within contact": 70, "arrows within solve": 35,
-    "lines of the package": 59300,
+    "lines of the package": 59076,
 }  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def counts():
         "heuristics": sum(row.kind == "heuristic" for row in thresholds.thresholds()),
         "arrows within contact": len(arrows("uem_dolfinx.contact")),
         "arrows within solve": len(arrows("uem_dolfinx.solve")),
-        "lines of the package": sum(p.read_text(encoding="utf-8").count("\n") for p in python_files("uem_dolfinx")),
+        "lines of the package": 59076sum(p.read_text(encoding="utf-8").count("\n") for p in python_files("uem_dolfinx")),
     }
 
 

@@ -141,14 +141,7 @@ def _none(gdim: int) -> list[Any]:
 
 
 class _Surface:
-    """The contactor's surface of a contact in the enriched space (collective).
-
-    Attributes:
-        nodes: owned nodes of the space on it ``(n,)``.
-        active: whether all contactors of a facet around them are active ``(n,)``.
-        tied: whether they are tied, or all contactors of a facet around them stick ``(n,)``.
-        width: number of equations of a node.
-    """
+    """The contactor's surface of a contact in the enriched space (collective)."""
 
     def __init__(self, enriched: Enriched, contact: Contact):
         config, self.enriched, self.contact = enriched.problem.config, enriched, contact
@@ -157,7 +150,7 @@ class _Surface:
         pair, nodes = contact.pair, enriched.nodes
         whole, rows = table_of(pair)
         friction = whole.friction
-        self.width = config.gdim if contact.tied or friction is not None else 1
+        self.width = config.gdim if contact.tied or friction is not None else 1  # number of equations of a node
         # active, stick, and mu s of contactors that slip, with their number
         state = np.zeros((config.n_owned, config.gdim + 3))
         state[pair.nodes, 0] = pair.tied if contact.tied else pair.trial.active
@@ -175,9 +168,9 @@ class _Surface:
             nodes.to_owners(self.dofs.ravel(), np.repeat(v, self.dofs.shape[1]))[: nodes.n_owned] > 0
             for v in (np.ones(len(whole)), *whole.T)
         )
-        self.nodes = np.flatnonzero(there)
-        self.active: Bools = active[self.nodes]
-        self.tied: Bools = tied[self.nodes]
+        self.nodes = np.flatnonzero(there)  # owned nodes of the space on it ``(n,)``
+        self.active: Bools = active[self.nodes]  # whether all contactors of a facet around them are active ``(n,)``
+        self.tied: Bools = tied[self.nodes]  # whether they are tied, or all contactors of a facet around them stick ``(n,)``
 
     def _dofs(self, tag: Any) -> Indices:
         """Local nodes of the enriched space on this rank's facets ``(m, nn)``."""

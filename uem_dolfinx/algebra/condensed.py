@@ -72,23 +72,19 @@ class Condensed(Returning):
     def drop(self) -> None:
         """Forget K (collective)."""
         self.lose()
-        #: Preconditioner that solves with K_II.
-        self._pc: Any = None
+        self._pc: Any = None  # preconditioner that solves with K_II
         #: K, the state of its values, and the components without Dirichlet condition.
         self._made_for: tuple[PETSc.Mat, int, Bools] | None = None
-        #: Whether a step begins: its C must not depend on contacts of earlier steps.
-        self._begins = False
+        self._begins = False  # whether a step begins: its C must not depend on contacts of earlier steps
         #: Mask of the owned nodes of C, their components, on rank 0 the number of components of every rank and S', and whether K_II has
         #: a negative determinant, and negative eigenvalues.
         self._nodes: Bools = np.zeros(self.space.n_owned, dtype=bool)
-        #: Whether C included the nodes adjacent to the followed nodes when it was made.
-        self._wide = False
+        self._wide = False  # whether C included the nodes adjacent to the followed nodes when it was made
         self._at: Ints = np.zeros(0, np.int64)
         self._counts: Ints | None = None
         self._St: Any = None
         self._negative_inside = self._indefinite_inside = False
-        #: P, Q, K and G of the constrained problem, and on rank 0 its dense matrix.
-        self.made_of: Any = None
+        self.made_of: Any = None  # P, Q, K and G of the constrained problem, and on rank 0 its dense matrix
         #: Its unknowns, if they are known without it.
         self._taken: PETSc.Vec | None = None
         self._dense: _Dense | None = None

@@ -47,12 +47,9 @@ EXTRAPOLATED = 1e-9
 class Rank(IntEnum):
     """Ranks of equations; the equations of the highest rank are dropped first."""
 
-    #: Equations that are never dropped in favour of others.
-    FIRM = 0
-    #: Equations of contactors in front of a facet.
-    WITHIN = 1
-    #: Equations of contactors past an end of the target.
-    PAST_END = 2
+    FIRM = 0  # equations that are never dropped in favour of others
+    WITHIN = 1  # equations of contactors in front of a facet
+    PAST_END = 2  # equations of contactors past an end of the target
 
 
 @dataclass(frozen=True)
@@ -125,12 +122,6 @@ class IndependentEquations:
         ring: mask of equations that follow each other in rings and depend on each other ``(m,)``, or None.
         firm: mask of equations that are never dropped, and depend on no other firm ones ``(m,)``, or None.
         pushing: mask of equations with forces that cannot be negative ``(m,)``, or None.
-
-    Attributes:
-        equations: the independent ones.
-        redundant: mask of given equations that were dropped because they depend on others ``(m,)``, known after ``forces``.
-        undetermined: mask of given equations that, after rotation, no longer determine their eliminated components ``(m,)``.
-        found: whether any equations on any rank conflict.
     """
 
     def __init__(
@@ -142,13 +133,15 @@ class IndependentEquations:
         firm: Bools | None = None,
         pushing: Bools | None = None,
     ):
+        #: mask of given equations that were dropped because they depend on others ``(m,)``, known after ``forces``.
         self.redundant: Bools = np.zeros(len(equations), dtype=bool)
+        #: mask of given equations that, after rotation, no longer determine their eliminated components ``(m,)``.
         self.undetermined: Bools = self.redundant
         conflicting = equations.active & _cannot_eliminate(equations, free)
         if ring is not None:
             conflicting |= ring
-        self.found = bool(reduced(space.comm, int(conflicting.any())))
-        self.equations = equations
+        self.found = bool(reduced(space.comm, int(conflicting.any())))  # whether any equations on any rank conflict
+        self.equations = equations  # the independent ones
         if not self.found:
             return
         self._conflicting = _with_neighbours(space, equations, conflicting)

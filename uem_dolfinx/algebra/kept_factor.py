@@ -32,13 +32,11 @@ class Returning:
     another one, until it is accepted or refused.
     """
 
-    #: Name of the attribute with a PETSc object; empty without one.
-    made: ClassVar[str] = ""
+    made: ClassVar[str] = ""  # name of the attribute with a PETSc object; empty without one
     #: Names of attributes that are of the same kind, and of those that ``restore`` does not bring back.
     parts: ClassVar[tuple[str, ...]] = ()
     stays: ClassVar[tuple[str, ...]] = ()
-    #: Attributes at the end of the last accepted step.
-    _last: dict[str, Any] | None = None
+    _last: dict[str, Any] | None = None  # attributes at the end of the last accepted step
 
     def commit(self) -> None:
         """Keep the present attributes (collective)."""
@@ -103,10 +101,8 @@ class KeptFactor(Returning):
         self.space = space
         self._pc: Any = None
         self._most = MOST_SOLVES
-        #: Whether the last solve was much cheaper than a factorisation may be.
-        self.cheap = True
-        #: Mask of the used columns of P, the diagonal of K, and whether Q is P.
-        self._made_with: Any = None
+        self.cheap = True  # whether the last solve was much cheaper than a factorisation may be
+        self._made_with: Any = None  # mask of the used columns of P, the diagonal of K, and whether Q is P
 
     def keep(self, pc: PETSc.PC, P: Restriction, K: PETSc.Mat, Q: Restriction) -> None:
         """Keep a new factorisation; not in mixed problems, where one tolerance does not fit residuals with different units."""

@@ -30,17 +30,12 @@ KEPT_SLOWER = 2.0
 
 
 class KeptPreconditioner(Returning):
-    """Equations that a preconditioner was made with, and its iterations per digit.
-
-    Attributes:
-        kept: whether it was made for an earlier matrix than the present one.
-    """
+    """Equations that a preconditioner was made with, and its iterations per digit."""
 
     def __init__(self) -> None:
-        self.kept = False
+        self.kept = False  # whether it was made for an earlier matrix than the present one
         self._made_with: UnitingEquations | None = None
-        #: Iterations per digit at first, and in the last solve.
-        self._first_pace = self._pace = 0.0
+        self._first_pace = self._pace = 0.0  # iterations per digit at first, and in the last solve
 
     def changes(self, equations: UnitingEquations) -> tuple[int, int]:
         """Number of owned equations activated or released since the preconditioner was made, and number active at that time."""
@@ -88,8 +83,7 @@ class KspOfOptions(Returning):
 
     def _create_ksp(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.space.comm)
-        #: The preconditioner of the options, which the KSP may use within a deflated one.
-        self.pc = ksp.getPC()
+        self.pc = ksp.getPC()  # the preconditioner of the options, which the KSP may use within a deflated one
         ksp.setOptionsPrefix(self._prefix)
         ksp.setErrorIfNotConverged(False)
         ksp.setConvergenceHistory(reset=True)

@@ -59,19 +59,16 @@ class UnitedSolver(KspOfOptions):
         self._served: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
         #: K condensed onto the contact, and whether the present constrained matrix uses it.
         self.condensed, self._on_condensed = Condensed(space), False
-        #: K condensed onto slots of contactors.
-        self.slots = KeptCondensation()
+        self.slots = KeptCondensation()  # K condensed onto slots of contactors
         #: Whether K is the same for every displacement, and K of the last constrained matrix with the state of its values.
         self.lasting = False
         self._of: tuple[PETSc.Mat, int] | None = None
-        #: Fingerprint of the matrices that the last constrained matrix was made of.
-        self._made_of: Any = None
+        self._made_of: Any = None  # fingerprint of the matrices that the last constrained matrix was made of
         #: Arguments of the present constrained matrix.
         self._arguments: tuple[Restriction, PETSc.Mat, PETSc.Mat | None, Restriction] | None = None
         #: P, K and Q of the present constrained matrix, if it is factorised and the factorisation may serve others.
         self._factor_of: tuple[Restriction, PETSc.Mat, Restriction] | None = None
-        #: Whether Q is not P, and whether a step begins.
-        self._petrov_galerkin = self._begins = False
+        self._petrov_galerkin = self._begins = False  # whether Q is not P, and whether a step begins
         self.commit()
 
     def forget(self) -> None:

@@ -76,8 +76,7 @@ class UnitedMatrix(Returning):
         self._A: Any = None
         #: Sorted keys of the additional blocks that K does not have: line of nodes times their number plus column.
         self._filled: Ints = np.zeros(0, np.int64)
-        #: Whether a step begins.
-        self._begins = False
+        self._begins = False  # whether a step begins
         #: Entries of K changed by the last update: blocks, positions of their lines, positions of single entries in matrix and K.
         self._changed: tuple[Blocks, Ints, Ints, Ints] | None = None
 
@@ -298,8 +297,7 @@ class UnitedMatrix(Returning):
         all_columns[_along(there[order], g)] = (g * sorted_columns[:, None] + np.arange(g, dtype=K.columns.dtype))[:, None]
         #: Lines of K's blocks in lines with additional blocks: positions in K and in the matrix.
         self._moved = _lines(places, width, g), there[: len(places)]
-        #: Lines of the additional blocks.
-        self._empty = there[len(places) :]
+        self._empty = there[len(places) :]  # lines of the additional blocks
         #: Contiguous pieces between lines with additional blocks: in the matrix and in K.
         self._runs = []
         begins, ends = np.append(0, g * (grown + 1)), np.append(g * grown, len(K.indptr) - 1)

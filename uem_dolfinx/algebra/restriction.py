@@ -78,8 +78,7 @@ class Restriction:
         self.n_equations, self._n_rows, wrong = (int(k) for k in reduced(self.comm, told))
         if wrong:
             agree(self.comm, error)
-        #: Columns of P that are in use ``(n_owned, block)``.
-        self.used: Bools = free.copy()
+        self.used: Bools = free.copy()  # columns of P that are in use ``(n_owned, block)``
         self.used[self.nodes] = (self.frames != 0).any(axis=1)
         self.rings: Rings | None = None
         self._hold(equations, prescribed)

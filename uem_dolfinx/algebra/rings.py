@@ -124,9 +124,6 @@ class Rings:
         lift: action of each equation on its node ``(m, block)``.
         parts: magnitudes of the coefficients with which equations (rows) follow others (columns) ``(m, m)``.
 
-    Attributes:
-        equations: in the order of the given ones.
-
     Raises:
         DependentRingError: if equations of a ring depend on each other.
     """
@@ -146,7 +143,7 @@ class Rings:
         solved = UnitingEquations.join([ring.equations for ring in self._rings], space.block)
         solved, back = send(space.comm, solved, self._exchange.origins[order])
         (at,) = back.send(place[order])
-        self.equations = _replaced(equations, solved, at)
+        self.equations = _replaced(equations, solved, at)  # in the order of the given ones
 
     def _check(self, space: Nodes, equations: UnitingEquations, bad: Bools) -> None:
         """Raise if any equations on any rank are in rings that could not be closed (collective)."""

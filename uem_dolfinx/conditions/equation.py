@@ -148,8 +148,7 @@ class Periodic(given.Sealed):
         self._follower, self._leader = follower, leader
         self.places = [follower, leader]
         self._map = given.kind("map", map, map is None or given.function(map), "a function of places (n, gdim), or None")
-        #: Rotation of the components, or None.
-        self.turn = None if turn is None else _rotation(turn)
+        self.turn = None if turn is None else _rotation(turn)  # rotation of the components, or None
         self.b = checked_value("jump", jump, None)
 
     def followers(self, config: Configuration) -> Indices:

@@ -34,8 +34,7 @@ class Link(given.Sealed, ABC):
             same = "the ground" if a is None else f"the same RigidCoupling, of '{a.name}'"
             raise InputError(f"a {self.name} has {same} on both sides: expected two different parts")
         self.a, self.b = a, b
-        #: Rigid couplings that it connects.
-        self.ends: list[RigidCoupling] = [one for one in (a, b) if one is not None]
+        self.ends: list[RigidCoupling] = [one for one in (a, b) if one is not None]  # rigid couplings that it connects
         self._gdim = len(self.ends[0].point)
         if len(self.ends[-1].point) != self._gdim:
             raise InputError(
@@ -157,10 +156,8 @@ class Joint(Link):
         self.point = given.vector("point", point, self._gdim)
         self.stiffness = given.number("stiffness", stiffness, given.NOT_NEGATIVE)
         self._at = self._spatial(self.point)
-        #: Last committed coordinate, which determines the number of full turns.
-        self.known = 0.0
-        #: Force and moment on b, as last computed.
-        self._reaction: tuple[Array, Array] = np.zeros(3), np.zeros(3)
+        self.known = 0.0  # last committed coordinate, which determines the number of full turns
+        self._reaction: tuple[Array, Array] = np.zeros(3), np.zeros(3)  # force and moment on b, as last computed
 
     def rows(self, at: dict[int, Placement]) -> list[Scalar]:
         """Scalars that vanish."""

@@ -130,8 +130,7 @@ class Relation:
         name: in messages.
     """
 
-    #: Joints have these, too: the number of rows, and their coordinate.
-    n_rows, known = 1, 0.0
+    n_rows, known = 1, 0.0  # joints have these, too: the number of rows, and their coordinate
 
     def __init__(self, ends: list[RigidCoupling], forms: Array, sides: RightSides, value: int, name: str):
         self.ends, self.described = ends, name

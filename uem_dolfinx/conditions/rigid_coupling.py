@@ -107,8 +107,7 @@ class RigidCoupling(given.Sealed):
                 "mass or inertia of a RigidCoupling with distribute=True: only a part that moves rigidly carries them; leave distribute "
                 "out, or give the part more density"
             )
-        #: The ``dynamics.added_mass.AddedMass`` of mass and inertia in a problem, or None.
-        self.added: Any = None
+        self.added: Any = None  #: The ``dynamics.added_mass.AddedMass`` of mass and inertia in a problem, or None.
         #: Last known rotation, which determines the number of full turns ``(n_turns,)``.
         self.turns: Array = np.zeros(self._sizes[1])
         #: Force and moment of the prescribed motion, as last computed.
@@ -116,8 +115,7 @@ class RigidCoupling(given.Sealed):
         #: Joints and springs that it takes part in.
         self.links: list[Any] = []
         self._set: RigidSet | None = None
-        #: Last values of functions of the load factor or time, by name.
-        self.evaluated: dict[str, Any] = {}
+        self.evaluated: dict[str, Any] = {}  #: Last values of functions of the load factor or time, by name.
 
     # -- in a problem ------------------------------------------------------------------------------------------------------
 

@@ -87,8 +87,7 @@ class RigidRows:
         self._free_nodes, self._free, self._avoided = free, free[own], avoided[own]
         ramped = np.array([is_ramped(v, loaded) for one in couplings for v in one.prescribed.values()], dtype=bool)
         self._ramped, self._n_prescribed = np.append(ramped, self._linked.ramped), len(ramped)
-        #: Values of the present step; before the first one, equations hold parts where they are.
-        self._wanted = self.values()
+        self._wanted = self.values()  # values of the present step; before the first one, equations hold parts where they are
         self._wanted[self._n_prescribed :] = self._linked.values_at(self.set.placements(config.displacement[: config.n_owned]))
         self._basis: Basis | None = None
         #: Displacement at the beginning of the ramp, its rigid motions, and the values of the rows of links.

@@ -77,18 +77,14 @@ class RigidSet:
         nodes: owned nodes.
         point: moves with the nodes, reference position ``(gdim,)``.
         large: whether rotations are finite.
-
-    Attributes:
-        X: reference positions of the nodes ``(n, gdim)``.
-        middle: their mean over all ranks ``(gdim,)``.
-        radius: root of their mean squared distance from the middle, a length.
     """
 
     def __init__(self, config: Configuration, nodes: Indices, point: Array, large: bool):
         self.config, self.nodes, self.point, self.large = config, nodes, point, large
-        self.X: Array = config.X[nodes]
+        self.X: Array = config.X[nodes]  # reference positions of the nodes ``(n, gdim)``
         self.count = reduced(config.comm, len(nodes))
-        self.middle = self._mean(self.X)
+        self.middle = self._mean(self.X)  # their mean over all ranks ``(gdim,)``
+        #: root of their mean squared distance from the middle, a length.
         self.radius = float(np.sqrt(self._mean(((self.X - self.middle) ** 2).sum(axis=1, keepdims=True))[0]))
 
     @property
@@ -149,19 +145,15 @@ class RigidSets:
 
     Args:
         sets: without common nodes, all with finite or all with small rotations.
-
-    Attributes:
-        nodes: owned nodes of all sets ``(n,)``.
-        part: index of the set of each node ``(n,)``.
-        X: reference positions of the nodes ``(n, gdim)``.
-        scale: of the components of z ``(n_z,)``, see ``RigidSet.scale``.
     """
 
     def __init__(self, sets: Sequence[RigidSet]):
         self.each, self.large = list(sets), sets[0].large
-        self.nodes: Indices = np.concatenate([one.nodes for one in sets])
+        self.nodes: Indices = np.concatenate([one.nodes for one in sets])  # owned nodes of all sets ``(n,)``
+        #: index of the set of each node ``(n,)``.
         self.part: Ints = np.repeat(np.arange(len(sets)), [len(one.nodes) for one in sets])
-        self.X: Array = np.concatenate([one.X for one in sets])
+        self.X: Array = np.concatenate([one.X for one in sets])  # reference positions of the nodes ``(n, gdim)``
+        #: of the components of z ``(n_z,)``, see ``RigidSet.scale``.
         self.scale: Array = np.concatenate([one.scale for one in sets])
         self._size = len(self.scale) // len(sets)
 

@@ -30,16 +30,13 @@ class RightSides:
         declared: the equations as users declared them.
         loaded: Constants that the load sets; other values are ramped with the Dirichlet values.
         at: load factor or time of the first evaluation of functions.
-
-    Attributes:
-        first: number of the first value of each declaration, and the number of all.
-        ramped: mask of values that are ramped ``(n_values,)``.
     """
 
     def __init__(self, config: Configuration, declared: Sequence[LinearEquations], loaded: Collection[fem.Constant], at: float):
         self._comm, self._block, self.declared = config.comm, config.block, list(declared)
         counts = [one.n_values(config.block) for one in self.declared]
-        self.first: Ints = np.cumsum([0, *counts])
+        self.first: Ints = np.cumsum([0, *counts])  # number of the first value of each declaration, and the number of all
+        #: mask of values that are ramped ``(n_values,)``.
         self.ramped: Bools = np.repeat([is_ramped(one.b, loaded) for one in self.declared], counts).astype(bool)
         self._evaluated: list[Any] = [None] * len(counts)
         self.take_load(at)

@@ -112,12 +112,6 @@ class UserRows:
         rigid: rows of couplings that make nodes rigid, together where joints or springs connect them.
         couplings: all couplings.
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
-
-    Attributes:
-        parts: linear equations, and the rows of couplings.
-        equations: of this rank, as last computed.
-        multipliers: forces along their eliminated components ``(m,)``, as last set.
-        turning: whether rows depend on the displacement.
     """
 
     def __init__(
@@ -130,10 +124,11 @@ class UserRows:
     ):
         self._free = free
         self._config, self.linear, self.each, self._couplings = config, linear, list(rigid), list(couplings)
+        #: linear equations, and the rows of couplings.
         self.parts: list[UnitedRows | RigidRows] = [one for one in (linear, *rigid) if one is not None]
-        self.turning: bool = any(one.set.large for one in self.each)
-        self.equations = self._joined()
-        self.multipliers: Array = np.zeros(len(self.equations))
+        self.turning: bool = any(one.set.large for one in self.each)  # whether rows depend on the displacement
+        self.equations = self._joined()  # of this rank, as last computed
+        self.multipliers: Array = np.zeros(len(self.equations))  # forces along their eliminated components ``(m,)``, as last set
         self._committed: tuple[Array, list[Any]] = self.multipliers, self.turns
 
     def _joined(self) -> UnitingEquations:

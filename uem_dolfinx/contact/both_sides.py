@@ -19,10 +19,8 @@ from uem_dolfinx.parallel import reduced
 class OfBothSides(ContactResults):
     """Results of a contact and of its further parts; those of a further part itself are zero, so that sums over contacts are right."""
 
-    #: Whether its results are those of another contact, of which it is a further part.
-    is_further_part = False
-    #: Whether the contactors of a further part are nodes of the contact's target.
-    swaps = False
+    is_further_part = False  #: Whether its results are those of another contact, of which it is a further part.
+    swaps = False  #: Whether the contactors of a further part are nodes of the contact's target.
     #: Further parts: nodes at corners of the target with the contactor's facets, and crossings of edges.
     further: Sequence[Any] = ()
 

@@ -119,8 +119,7 @@ class Contact(WatchedContact, given.Sealed):
     SETTABLE = dict.fromkeys(("friction", "offset"))
     cohesion: Cohesive | Adhesion | None = None
     leak: Leak | None = None
-    #: Whether it is part of a general contact.
-    of_all_surfaces = False
+    of_all_surfaces = False  #: Whether it is part of a general contact.
 
     def __init__(
         self,

@@ -57,9 +57,6 @@ class ScalarTie:
         config: nodes of the scalar field.
         contact: the tie, marked as part of the problem.
         free: nodes without Dirichlet condition ``(n_owned, 1)``.
-
-    Attributes:
-        followed: owned nodes of the target, eliminated only in equations without another node to eliminate.
     """
 
     firm = False
@@ -95,6 +92,7 @@ class ScalarTie:
         followed = np.zeros(config.n_owned, dtype=bool)
         followed[Halo(config, theirs).asked] = True
         followed[Halo(config, own).asked] = False
+        #: owned nodes of the target, eliminated only in equations without another node to eliminate.
         self.followed: Indices = np.flatnonzero(followed).astype(np.int32)
 
     def n_values(self, block: int) -> int:

@@ -104,8 +104,7 @@ class Material:
     expansion: float = 0.0
     conductivity: float | None = None
     heat_capacity: float = 0.0
-    #: Parts of mass and of stiffness that damp.
-    damping: tuple[float, float] = (0.0, 0.0)
+    damping: tuple[float, float] = (0.0, 0.0)  # parts of mass and of stiffness that damp
 
 
 @dataclass

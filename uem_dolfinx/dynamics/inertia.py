@@ -101,10 +101,8 @@ class Dynamics(given.Sealed):
         self.resumed, self.accelerated, self.moving, self._attached = 0, False, False, False
         #: Length of the last committed step, zero before the first, and the factor of M in the tangent.
         self.last = self.factor = self.driven = self.dt = 0.0
-        #: Masses at points of rigid couplings.
-        self.added: list[AddedMass] = []
-        #: Virtual work of the damping forces.
-        self.damping_form: ufl.Form | None = None
+        self.added: list[AddedMass] = []  #: Masses at points of rigid couplings.
+        self.damping_form: ufl.Form | None = None  #: Virtual work of the damping forces.
 
     def attach(self, config: Configuration) -> ufl.Form | None:
         """Attach to the problem's displacement, check that all arguments fit it, and return the damping form (collective)."""
@@ -141,8 +139,7 @@ class Dynamics(given.Sealed):
             config.comm, "Dynamics", gravity=self._down, time=self.time, contactors=self.contactors, scheme=str(self.scheme)
         )
         self._copy_committed()
-        #: Inertia forces of the committed state, which balance all other forces.
-        self.forces = fem.Function(config.V)
+        self.forces = fem.Function(config.V)  #: Inertia forces of the committed state, which balance all other forces.
         if self.damping is not None:
             self._rate, self.past = fem.Constant(config.mesh, 0.0), fem.Function(config.V)
             self.past.x.array[:] = self.velocity.x.array

@@ -38,15 +38,12 @@ class ByState:
 
 
 class RateSlopes:
-    """Derivatives through the time steps of a problem, from the last to the first.
-
-    Attributes:
-        by: derivatives by the final state of the present step, and by its initial state after ``pass_back``; zero at first.
-    """
+    """Derivatives through the time steps of a problem, from the last to the first."""
 
     def __init__(self, dynamics: Dynamics):
         self._dynamics = dynamics
         self._n = dynamics.massy.size
+        #: derivatives by the final state of the present step, and by its initial state after ``pass_back``; zero at first.
         self.by = ByState(*np.zeros((5, self._n)))
 
     def begin(self) -> None:

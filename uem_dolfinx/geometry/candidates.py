@@ -171,15 +171,10 @@ class RankBoxes:
 
 
 class _Group:
-    """The points of this rank by kinds, and the boxes around them.
-
-    Attributes:
-        kind: of each point ``(n,)``.
-        ends: a distance for each kind within which every point of it has a position ``(n_kinds,)``; infinite without any.
-    """
+    """The points of this rank by kinds, and the boxes around them."""
 
     def __init__(self, boxes: RankBoxes, points: Array, kind: Ints | None):
-        self.kind = np.zeros(len(points), np.int64) if kind is None else kind
+        self.kind = np.zeros(len(points), np.int64) if kind is None else kind  # of each point ``(n,)``
         n_kinds, g = boxes.low.shape[1:]
         low, high = np.full((n_kinds, g), np.inf), np.full((n_kinds, g), -np.inf)
         np.minimum.at(low, self.kind, points)
@@ -189,6 +184,7 @@ class _Group:
             near = np.linalg.norm(np.maximum(np.maximum(boxes.low - high, low - boxes.high), 0.0), axis=2)
             far = np.linalg.norm(np.maximum(np.abs(high - boxes.low), np.abs(low - boxes.high)), axis=2)
         self._near = np.where(some, near, np.inf)
+        #: a distance for each kind within which every point of it has a position ``(n_kinds,)``; infinite without any.
         self.ends = np.where(some, far, np.inf).min(axis=0)
 
     def ranks_within(self, distances: Array) -> Iterator[int]:

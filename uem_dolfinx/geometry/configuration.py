@@ -27,10 +27,8 @@ class Configuration(Nodes):
         SpaceError: if ``u`` is not in a blocked Lagrange space of degree 1 or 2 with one component per coordinate.
     """
 
-    #: Whether the unknowns move the nodes; a scalar field does not.
-    moves = True
-    #: Name of the solution in results and checkpoints.
-    name = "displacement"
+    moves = True  # whether the unknowns move the nodes; a scalar field does not
+    name = "displacement"  # name of the solution in results and checkpoints
     #: Equations of users, and those that give nodes one displacement, see ``conditions.seams.seams_of``.
     equations: Sequence[Any] = ()
     seams: Any = None

@@ -255,10 +255,6 @@ class SharpEdges:
 
     Args:
         facets: of the surface.
-
-    Attributes:
-        total: number of pieces over all ranks.
-        facet: this rank's facet of each piece ``(k,)``.
     """
 
     def __init__(self, facets: TargetFacets):
@@ -272,8 +268,8 @@ class SharpEdges:
         along = facets.dofs[facet[:, None], order[side]]
         self._ends = np.stack([along[:, :-1], along[:, 1:]], axis=2).reshape(-1, 2)
         self._pieces = along.shape[1] - 1
-        self.facet = np.repeat(facet, self._pieces)
-        self.total = int(reduced(comm, len(self.facet)))
+        self.facet = np.repeat(facet, self._pieces)  # this rank's facet of each piece ``(k,)``
+        self.total = int(reduced(comm, len(self.facet)))  # number of pieces over all ranks
 
     @property
     def nodes(self) -> Ints:

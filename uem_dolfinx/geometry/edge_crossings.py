@@ -181,11 +181,6 @@ class Crossings:
         overlap: bound on the initial penetration, a length.
         n_lists: how many crossings a node may have at once.
         ridges: whether only those count at which facets near the crossing do not touch, as others have the facets' integrals.
-
-    Attributes:
-        nodes: owned nodes on edges, the contactors ``(n,)``.
-        held: facets of the crossings that hold the contactors now, -1 for none ``(n_lists, n)``.
-        lists: contactors with a crossing, and these, for each list.
     """
 
     def __init__(
@@ -195,12 +190,13 @@ class Crossings:
         self._least = RIDGES if ridges else -SECTOR
         self.first, self.second, self._keys, self._meet, self._overlap = first, second, keys, meet, overlap
         config = self._config = first.facets.config
-        self.nodes = config.gather_owned(first.nodes.ravel())
+        self.nodes = config.gather_owned(first.nodes.ravel())  # owned nodes on edges, the contactors ``(n,)``
         #: Owned nodes of all lines, and positions at the end of the last step.
         self._watched: Ints = np.union1d(self.nodes, config.gather_owned(second.nodes.ravel()))
         self._committed, self._keeps = self._x, False
+        #: facets of the crossings that hold the contactors now, -1 for none ``(n_lists, n)``.
         self.held: Ints = np.full((n_lists, len(self.nodes)), -1)
-        self.lists: list[tuple[Ints, Opposite]] = []
+        self.lists: list[tuple[Ints, Opposite]] = []  # contactors with a crossing, and these, for each list
         #: Nodes at crossings, owned, and the visibility keys of the edges that hold them.
         self.at_crossings: tuple[Ints, Ints] = (np.zeros(0, np.int64), keys[0][:0])
         self._made_at: tuple[Array, Ints] | None = None

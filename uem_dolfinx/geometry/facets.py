@@ -47,8 +47,7 @@ class TargetFacets:
         OrientationError: if a facet lies between two cells, so that the outward direction is undefined.
     """
 
-    #: The facets at their last positions; None before the first call of ``current``.
-    _placed: FacetData | None = None
+    _placed: FacetData | None = None  # the facets at their last positions; None before the first call of ``current``
 
     def __init__(self, config: Configuration, tag: Tag, role: str = "target"):
         self.config, self.tag, self.role = config, tag, role
@@ -57,8 +56,7 @@ class TargetFacets:
         self.shape: FacetShape = _shape_of(config)
         self.nodes = config.to_global(self.dofs)
         self._refuse_inner()
-        #: Local numbers of the facets in the mesh ``(m,)``.
-        self.entities: Indices = tag.entities[of.own]
+        self.entities: Indices = tag.entities[of.own]  # local numbers of the facets in the mesh ``(m,)``
         self._orient(cell_dofs)
         self.open_sides = self._open_sides()
         #: Nodes of each facet on a side, of any facet, that bounds the surface ``(m, nn)``.
@@ -94,8 +92,7 @@ class TargetFacets:
         inward = X[cell_dofs[self.cells]] - np.einsum("na,nag->ng", tab.N, x)[:, None]
         height = np.einsum("ng,nkg->nk", unit_normals(tab, x), inward)
         self.sign = np.where(height.mean(axis=1) > 0, -1.0, 1.0)
-        #: Depth of the cell behind each facet, a length ``(m,)``.
-        self.depth: Array = np.abs(height).max(axis=1)
+        self.depth: Array = np.abs(height).max(axis=1)  # depth of the cell behind each facet, a length ``(m,)``
 
     def _refuse_inner(self) -> None:
         """Raise on facets that lie between two cells, on any rank."""

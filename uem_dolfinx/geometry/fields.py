@@ -34,9 +34,6 @@ class ConfigurationAmongFields(Configuration):
         w: Function of the mixed space.
         displacement: number of the part, of vector Lagrange elements of degree 1 or 2.
 
-    Attributes:
-        dofs: local unknowns of w for the components of the local nodes ``(n_local, gdim)``.
-
     Raises:
         InputTypeError, InputError, SpaceError: if w has no mixed space or no such part, or if the part is not a displacement.
     """
@@ -51,11 +48,11 @@ class ConfigurationAmongFields(Configuration):
         V = compat.function_space(W.mesh, degree, (W.mesh.geometry.dim,))
         self._take(V)
         nodes, own = compat.cell_dofs(V), compat.part_dofs(W, self.part)
+        #: local unknowns of w for the components of the local nodes ``(n_local, gdim)``.
         self.dofs: Ints = np.zeros((self.n_local, self.gdim), dtype=np.int64)
         if len(nodes):
             self.dofs[nodes.ravel()] = own.reshape(-1, self.gdim)
-        #: ``NodalField`` of other parts by their number, made when needed.
-        self.nodal_fields: dict[int, Any] = {}
+        self.nodal_fields: dict[int, Any] = {}  # ``NodalField`` of other parts by their number, made when needed
         self._unknowns = Unknowns(self)
         first = np.append(self._first_nodes[:-1], np.iinfo(np.int64).max)
         numbers = super().to_global(np.arange(self.n_local))
@@ -211,8 +208,7 @@ class Unknowns(Nodes):
             count += width
         self.field, self.kind = np.full((2, self.block * self.n_owned), -1)
         self.field[self.place], self.kind[self.place] = field[:n], kind[:n]
-        #: Field of every local unknown of the mixed space, including ghosts.
-        self.field_of: Ints = field
+        self.field_of: Ints = field  # field of every local unknown of the mixed space, including ghosts
 
     def norms(self, v: PETSc.Vec) -> Array:
         """Norm of each field's part of a vector, the displacement first ``(n_fields,)`` (collective)."""
@@ -351,10 +347,6 @@ class NodalField:
         part: number of the field in the mixed space.
         what: user of the field, for messages.
 
-    Attributes:
-        unknowns: local unknowns of the mixed space for the value at each local node ``(n_local, k)``.
-        weights: weights of these unknowns ``(n_local, k)``.
-
     Raises:
         InputError, SpaceError: if the space has no such part, or if it is not a scalar Lagrange field of at most the displacement's
             degree.
@@ -372,8 +364,9 @@ class NodalField:
         # unknowns of the cell by their weight at each node, the largest first
         k = int((shape != 0).sum(axis=1).max())
         order = np.argsort(-np.abs(shape), axis=1, kind="stable")[:, :k]
+        #: local unknowns of the mixed space for the value at each local node ``(n_local, k)``.
         self.unknowns: Ints = np.zeros((config.n_local, k), dtype=np.int64)
-        self.weights: Array = np.zeros((config.n_local, k))
+        self.weights: Array = np.zeros((config.n_local, k))  # weights of these unknowns ``(n_local, k)``
         if len(nodes):
             self.unknowns[nodes] = own[:, order]
             self.weights[nodes] = np.take_along_axis(shape, order, axis=1)

@@ -27,9 +27,6 @@ class JoinedFacets(TargetFacets):
 
     Args:
         surfaces: the S joined surfaces.
-
-    Attributes:
-        surface: number of the surface of each facet ``(m,)``.
     """
 
     def __init__(self, config: Configuration, surfaces: Sequence[TargetFacets]):
@@ -42,7 +39,7 @@ class JoinedFacets(TargetFacets):
         self.open_sides = np.concatenate([s.open_sides for s in surfaces])
         self.open_nodes = np.concatenate([s.open_nodes for s in surfaces])
         sizes = np.array([len(s.dofs) for s in surfaces])
-        self.surface: Ints = np.repeat(np.arange(len(surfaces)), sizes)
+        self.surface: Ints = np.repeat(np.arange(len(surfaces)), sizes)  # number of the surface of each facet ``(m,)``
         every = np.empty((config.comm.size, len(surfaces)), dtype=sizes.dtype)
         config.comm.Allgather(sizes, every)
         #: First facet of every surface on every rank, and first numbers of each surface's own numbering.

@@ -104,17 +104,14 @@ class Neighbours:
         self._bodies, self._begin = np.unique(skin.body_of_node[self._watched], return_index=True)
         self._committed = config.x.copy()
         self._last_motion = np.zeros(skin.n_bodies)
-        #: Facets that hold nodes now, by list ``(n_lists, n)``, -1 for none.
-        self.held: Ints = np.full((n_lists, len(nodes)), -1)
-        #: Number of the order of the bodies.
-        self.number = next(_orders)
+        self.held: Ints = np.full((n_lists, len(nodes)), -1)  # facets that hold nodes now, by list ``(n_lists, n)``, -1 for none
+        self.number = next(_orders)  # number of the order of the bodies
         self._made_at: Array | None = None
         self._kept, self._farther = False, 0.0
         self._reach = np.zeros(skin.n_bodies)
         self._lasts = self._reach
         self.lists: list[Listing] = []
-        #: How often lists have been made.
-        self.times_made = 0
+        self.times_made = 0  # how often lists have been made
         self._at_start: dict[str, Any] | None = None
 
     def _motion(self, since: Array) -> Array:
@@ -340,8 +337,7 @@ class Neighbour(MeshTarget):
         averaged: see ``MeshTarget``.
     """
 
-    #: Nearby facets are found from the lists, not by bounding boxes.
-    measures = False
+    measures = False  # nearby facets are found from the lists, not by bounding boxes
 
     def __init__(self, neighbours: Neighbours, number: int, averaged: bool = False):
         super().__init__(neighbours.skin, averaged)

@@ -81,8 +81,7 @@ class Nodes:
         v.array[:] = 0.0 if values is None else np.asarray(values).reshape(-1)
         return v
 
-    #: Whether there are unknowns in addition to nodal ones.
-    mixed = False
+    mixed = False  # whether there are unknowns in addition to nodal ones
 
     def create_matrix(self, a: Any) -> PETSc.Mat:
         """Matrix for a compiled bilinear form (collective)."""
@@ -207,8 +206,7 @@ class Halo:
         self._space, self._size = space, len(nodes)
         self._exchange = Exchange.to(space.comm, space.owner_of(nodes))
         (asked,) = self._exchange.send(nodes)
-        #: Local numbers of the owned nodes that other ranks need, with repetitions.
-        self.asked: Ints = asked - space.first
+        self.asked: Ints = asked - space.first  # local numbers of the owned nodes that other ranks need, with repetitions
 
     def take(self, values: Callable[[Ints], Array]) -> Array:
         """Values of the owners at the nodes ``(m, ...)``, from ``values`` at their local nodes ``(k,)``, rows of any shape (collective)."""

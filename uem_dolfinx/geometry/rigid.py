@@ -132,10 +132,8 @@ class RigidSurface(given.Sealed):
 
     n_nodes = 0
     averaged = faceted = False
-    #: Whether gaps are distances everywhere, not only on the surface.
-    measures = False
-    #: Whether functions are the user's, which may raise or return other shapes than asked for.
-    of_user = True
+    measures = False  #: Whether gaps are distances everywhere, not only on the surface.
+    of_user = True  #: Whether functions are the user's, which may raise or return other shapes than asked for.
     dofs: Indices = np.zeros((0, 0), np.int32)
     keys: Ints = np.zeros(0, np.int64)
 

@@ -110,8 +110,7 @@ class MeshTarget:
             )  # fmt: skip
         return replace(self._nowhere, foot=points)
 
-    #: Gaps are distances everywhere, and bounding boxes detect surfaces that are separated.
-    measures = True
+    measures = True  # gaps are distances everywhere, and bounding boxes detect surfaces that are separated
 
     @property
     def faceted(self) -> bool:

@@ -50,8 +50,7 @@ class Skin(TargetFacets):
 
     def __init__(self, config: Configuration, tag: Tag):
         super().__init__(config, tag, "surface")
-        #: Spread of the facets at their last positions; None if it has not been computed there.
-        self._spread: Array | None = None
+        self._spread: Array | None = None  # spread of the facets at their last positions; None if it has not been computed there
         label, self.n_bodies = find_bodies(config)
         first = np.full(self.n_bodies, np.iinfo(np.int64).max)
         cells = compat.cell_dofs(config.V)
@@ -60,8 +59,7 @@ class Skin(TargetFacets):
         number[np.argsort(reduced(config.comm, first, op=MPI.MIN))] = np.arange(self.n_bodies)
         self.body_of_node: Ints = number[label]
         self.body: Ints = self.body_of_node[self.dofs[:, 0]]
-        #: Half of the longest side of each facet ``(m,)``.
-        self.radius: Array = 0.5 * self._sides().max(axis=1, initial=0.0)
+        self.radius: Array = 0.5 * self._sides().max(axis=1, initial=0.0)  # half of the longest side of each facet ``(m,)``
         sums, side = np.zeros((self.n_bodies, 3)), self._sides().mean(axis=1)
         np.add.at(sums, self.body, np.column_stack([side, side ** (config.gdim - 1), np.ones(len(self.body))]))
         side_sum, self.area, count = reduced(config.comm, sums).T

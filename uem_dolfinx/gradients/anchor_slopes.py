@@ -60,9 +60,6 @@ class AnchorSlopes:
     Args:
         pair: the interface, in the trial state of the step.
 
-    Attributes:
-        stuck: mask of contactors at their anchors ``(n,)``.
-
     Raises:
         InputError: for contactors held by corners or edges of the target, or with zero slip, whose direction is undefined.
     """
@@ -74,6 +71,7 @@ class AnchorSlopes:
         active = self._sliding.active(state)
         assert state.friction is not None
         held = self._sliding.frame.free_tangents.any(axis=(1, 2))
+        #: mask of contactors at their anchors ``(n,)``.
         self.stuck: Bools = active & state.friction.stick & ~state.redundant & held
         self._slips = self._sliding.slipping(state)
         self._anchor, friction = self._tangents_at_anchors(), self._sliding

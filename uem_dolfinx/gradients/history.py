@@ -54,16 +54,12 @@ class History(given.Sealed):
         self.problem = problem
         self._first = problem.progress.steps
         self._records = Records(folder)
-        #: Digest of the positions of the nodes in each step.
-        self._places: list[bytes] = []
-        #: Initial state of a motion; None in statics.
-        self._start: Record | None = None
-        #: Constants and contacts ramped by steps, referenced here so that their ids stay unique.
-        self._led: list[Any] = []
+        self._places: list[bytes] = []  # digest of the positions of the nodes in each step
+        self._start: Record | None = None  # initial state of a motion; None in statics
+        self._led: list[Any] = []  # Constants and contacts ramped by steps, referenced here so that their ids stay unique
         #: Numbers of the steps that ramped them first; what their values end at has no share in steps before.
         self._led_from: list[int] = []
-        #: Constants that Steps set by functions of the load factor.
-        self._by_function: list[fem.Constant] = []
+        self._by_function: list[fem.Constant] = []  # Constants that Steps set by functions of the load factor
         #: Laws with history that have derivatives.
         self._laws: list[Any] = problem.materials
         F = problem.bodies.F

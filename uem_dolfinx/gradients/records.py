@@ -47,10 +47,8 @@ class Records:
 
     def __init__(self, folder: Path | None = None):
         self._file: Any = None if folder is None else tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
-        #: Stored record of every step, and its stored values one by one.
-        self._steps: list[tuple[Any, list[Any]]] = []
-        #: Values of the last step.
-        self._last: list[Array] = []
+        self._steps: list[tuple[Any, list[Any]]] = []  # stored record of every step, and its stored values one by one
+        self._last: list[Array] = []  # values of the last step
 
     def __len__(self) -> int:
         return len(self._steps)

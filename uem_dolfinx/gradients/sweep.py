@@ -59,14 +59,11 @@ class Sweep:
     Args:
         problem: of the steps.
         controls: of the derivatives.
-
-    Attributes:
-        found: derivatives by the controls so far; None before the first step.
     """
 
     def __init__(self, problem: UnitedProblem, controls: Sequence[AnyControl]):
         self.problem, self._controls = problem, controls
-        self.found: list[Any] = [None] * len(controls)
+        self.found: list[Any] = [None] * len(controls)  # derivatives by the controls so far; None before the first step
         self._derivatives = Derivatives(problem.bodies.F, problem.u.function_space, problem.config.V)
         self._by_anchors = [np.zeros((0, 0))] * len(problem.interfaces)
         self._sections = [section_of(pair) for pair in problem.interfaces]

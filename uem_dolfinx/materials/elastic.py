@@ -279,8 +279,7 @@ class HistoryMaterial(Protocol):
     A law may find its tangent in a method ``differentiate()``, which is called before K is assembled, instead of in ``update``.
     """
 
-    #: Committed Functions that the stress depends on, by name.
-    history: dict[str, Any]
+    history: dict[str, Any]  # committed Functions that the stress depends on, by name
 
     def stiffness(self, du: Any, v: Any) -> ufl.Form:
         """Part of the tangent that is missing in the derivative of the residual form: the stress's change with the displacement."""

@@ -43,11 +43,6 @@ class QuadraturePoints:
         cells: local indices of owned cells ``(n_cells,)``.
         degree: of the rule; 0 is the cells' centre, for use together with other rules. It is replaced by points close to the centre:
             with a single point, FFCx treats gradients and Jacobians as constant in the cell, also at points of other rules.
-
-    Attributes:
-        points: on the reference cell, ``(n_points, tdim)``.
-        dx: UFL measure over *all* cells by this rule; Functions of this rule are zero outside of ``cells`` unless written elsewhere.
-        volumes: of the points, of whole circles if the mesh is axisymmetric, ``(n_cells, n_points)``.
     """
 
     def __init__(self, domain: Any, cells: Indices, degree: int):
@@ -57,12 +52,15 @@ class QuadraturePoints:
         metadata: dict[str, Any] = {"quadrature_degree": degree}
         self.points, weights = forms.quadrature_rule(compat.cell_name(domain), degree)
         if degree == 0:
+            #: on the reference cell, ``(n_points, tdim)``.
             self.points = self.points + BESIDE_CENTRE * np.array(DIRECTIONS[domain.topology.dim])
             weights = np.full(len(self.points), weights[0] / len(self.points))
             points = {"quadrature_points": self.points.tolist(), "quadrature_weights": weights.tolist()}
             metadata = {"quadrature_rule": "custom", **points}
+        #: UFL measure over *all* cells by this rule; Functions of this rule are zero outside of ``cells`` unless written elsewhere.
         self.dx = ufl.dx(domain=domain, metadata=metadata)
         jacobian = self.evaluate(self.compile(ufl.JacobianDeterminant(domain)))
+        #: of the points, of whole circles if the mesh is axisymmetric, ``(n_cells, n_points)``.
         self.volumes: Array = np.abs(jacobian.reshape(len(cells), len(weights))) * weights
         if is_axisymmetric(domain):
             self.volumes *= self.evaluate(self.compile(circumference(domain))).reshape(self.volumes.shape)

@@ -124,23 +124,20 @@ class VonMises(given.Sealed):
         self.u, self.displacement, self.kind, self.strain = u, displacement, kind, strain
         self.mesh, self.comm = u.function_space.mesh, u.function_space.mesh.comm
         degree = self._degree_of(u)
-        #: The displacement in UFL.
-        self._moved = u if displacement is None else ufl.split(u)[displacement]
+        self._moved = u if displacement is None else ufl.split(u)[displacement]  # the displacement in UFL
         self.cells = owned_cells(self.mesh, cells)
         degrees = self._degrees(degree, quadrature_degree)
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, one) for one in degrees)
         self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
         self.handed["kinematic_hardening"] = kinematic_hardening
         self._told = self.handed | {"cells": cells}
-        #: Yield stress over peeq; with a table, the yield curve of the layers.
-        self._curve: YieldCurve
+        self._curve: YieldCurve  # yield stress over peeq; with a table, the yield curve of the layers
         self._layers: Layers | None = None
         self._read_parameters(E, nu, yield_stress, hardening, kinematic_hardening)
         self._create_functions()
         self._compile()
         self._spread = self._points.spread_from(self._pressure_points)
-        #: Outcome of the last update, which was at a displacement ``_at``.
-        self._trial: Returned | Flowed
+        self._trial: Returned | Flowed  # outcome of the last update, which was at a displacement ``_at``
         self.update()
 
     def _compile(self) -> None:

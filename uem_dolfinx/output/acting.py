@@ -174,15 +174,12 @@ class Actions:
 
     Args:
         outside: surface of its bodies.
-
-    Attributes:
-        found: items collected so far, on rank 0.
     """
 
     def __init__(self, problem: UnitedProblem, outside: Outside):
         self.problem, self.config, self.comm, self._outside = problem, problem.config, problem.comm, outside
         self.gdim = problem.config.gdim
-        self.found: list[Acting] = []
+        self.found: list[Acting] = []  # items collected so far, on rank 0
 
     def act(self, kind: str, name: str, at: Array, vectors: Array, outward: Array | None = None) -> None:
         """Collect an item at positions of this rank (collective)."""

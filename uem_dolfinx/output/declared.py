@@ -69,9 +69,6 @@ class Declarations:
     Args:
         at: load factor or time of the loads; None for the present loads.
         loads: whether loads that are terms of the residual are included.
-
-    Attributes:
-        found: on rank 0, None elsewhere.
     """
 
     def __init__(self, problem: UnitedProblem, at: float | None, loads: bool):
@@ -102,7 +99,7 @@ class Declarations:
             outside.gather(*outside.facets(clamped)),
         )
         skin = outside.gather(outside.X[outside.faces])
-        self.found: Declared | None = None
+        self.found: Declared | None = None  # on rank 0, None elsewhere
         if polygon is not None and clamps is not None and skin is not None:
             _, labels = np.unique(polygon[1], return_inverse=True)
             first = np.full(labels.max() + 1, np.iinfo(np.int64).max)

@@ -86,8 +86,7 @@ class Drawing:
         self.label = label or (size if field is None else "contact pressure" if pressed else "")
         self.levels, self.window, self.mirror, self.cells, self.cmap = levels, window, mirror, cells, cmap
         self.percentiles, self.triad, self.pressed = percentiles, triad, pressed
-        #: Width of an image of a 3D scene in points.
-        self.width = 1600
+        self.width = 1600  # width of an image of a 3D scene in points
         self.comm = problem.comm
         gathering = Gathering(problem, field, scale, gdim == 2 if arrows is None else bool(arrows), surface, box, rigid)
         self.take, self.pieces = gathering.take, gathering.pieces
@@ -165,8 +164,7 @@ class Drawn(ABC):
         )
         if how.pressed and self.bounds[0] == 0.0:
             self.bounds[0] = EVEN * self.bounds[-1]
-        #: Ends of the colour bar with an arrow.
-        self.extend = "neither"
+        self.extend = "neither"  # ends of the colour bar with an arrow
         if not isinstance(how.levels, int) or how.percentiles is not None or how.pressed:
             self.extend = ("neither", "min", "max", "both")[int(least < self.bounds[0]) + 2 * int(most > self.bounds[-1])]
         self.cmap = _colours(how.cmap, how.pressed)

@@ -97,8 +97,7 @@ class EnergyBook(Closing, given.Sealed):
                 raise SpaceError("stored does not depend on the problem's displacement: expected the energy of its u")
         works = *(None if work is None else revolved(work) for work in (stored, external)), self.dynamics.damping_form
         self._stored, self._external, self._damping = (None if work is None else forms.form(work) for work in works)
-        #: Rows written, in order.
-        self.rows: list[Energies] = []
+        self.rows: list[Energies] = []  #: Rows written, in order.
         #: Momenta ``(gdim,)`` and impulses on the contactors' bodies ``(n_contacts, gdim)`` of the rows.
         self.momenta: list[Array] = []
         self.impulses: list[Array] = []

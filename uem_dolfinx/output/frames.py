@@ -150,8 +150,7 @@ class Gathering:
         #: Vertices of this rank that are drawn.
         self._used = np.unique(faces)
         parts = problem.comm.gather((len(self._used), np.searchsorted(self._used, faces), np.searchsorted(self._used, edges)))
-        #: On rank 0.
-        self.pieces: Pieces | None = None
+        self.pieces: Pieces | None = None  # on rank 0
         if parts is not None:
             starts = np.cumsum([0, *(n for n, _, _ in parts)])
             self.pieces = Pieces(*(np.concatenate([p[k] + start for p, start in zip(parts, starts)]) for k in (1, 2)))

@@ -57,8 +57,7 @@ class HistoryWriter(Closing, given.Sealed):
         InputError, InputTypeError, UserFunctionError: if a column cannot be computed.
     """
 
-    #: Owner of the table in messages.
-    _whose = "a HistoryWriter"
+    _whose = "a HistoryWriter"  # owner of the table in messages
 
     def __init__(
         self,
@@ -85,8 +84,7 @@ class HistoryWriter(Closing, given.Sealed):
         except Exception:
             self.table.close()
             raise
-        #: Time of the last row.
-        self._last = self.table.last.get(names[0], -np.inf)
+        self._last = self.table.last.get(names[0], -np.inf)  # time of the last row
         #: Last step contained in a resumed file, -1 for a new file.
         self._known = problem.progress.steps if self.table.last else -1
 

@@ -77,8 +77,7 @@ class Sketch:
         self.size = float(np.diff(ends, axis=1).max())
         flat = len(ends) == 2
         self.tick, self.unit = (0.025 if flat else 0.032) * self.size, 0.11 * self.size
-        #: Distance between symbols of one kind, in these lengths.
-        self.spacing = 2.0 if flat else 3.5
+        self.spacing = 2.0 if flat else 3.5  # distance between symbols of one kind, in these lengths
         #: Whether all contacts share one pair of colours, because there are too many.
         self.many = 1 + max((s.pair for s in found.surfaces), default=0) > len(PAIRS)
         #: Colours of drawn items by kind of symbol and name.

@@ -64,8 +64,7 @@ class SurfaceWriter(Closing, given.Sealed):
             self._folder.mkdir(exist_ok=True)
 
         on_rank_0(comm, f"the surfaces {self._stem} cannot be written", begin)
-        #: Facets of each contact, by its name in files.
-        self._facets: list[tuple[Any, str, list[TargetFacets]]] = []
+        self._facets: list[tuple[Any, str, list[TargetFacets]]] = []  # facets of each contact, by its name in files
         for contact, suffix in zip(problem.declared, contact_suffixes(problem.declared)):
             tags: dict[int, Tag] = {id(part.contactor): part.contactor for part in getattr(contact, "parts", [contact])}
             found = [TargetFacets(problem.config, tag, "contactor") for tag in tags.values() if tag.dim > 0]

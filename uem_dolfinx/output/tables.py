@@ -107,8 +107,7 @@ class CsvTable(Closing):
         self._resumed = 0 if self._clock is None else self._clock.resumed
         until: Any = resume_at if self._clock is None else self._clock.time
         self._closed = False
-        #: On rank 0.
-        self._file: OwnFile | None = None
+        self._file: OwnFile | None = None  # on rank 0
         #: End of the kept rows in the file, and whether later rows follow, which would be lost.
         self._end, self._later = 0, False
         kept = self._on_rank_0(lambda: self._begin(until))
@@ -263,9 +262,6 @@ class Columns:
         reaction: part of the mesh with Dirichlet conditions, as in ``UnitedProblem.reaction``, or several parts by name; or None.
         quantities: functions without arguments by name that return a number or a vector, the same on all ranks; or None.
 
-    Attributes:
-        names: of the columns.
-
     Raises:
         InputError, InputTypeError: for arguments of another form, and for duplicate names.
     """
@@ -289,7 +285,7 @@ class Columns:
                     raise InputError(f"columns[{name!r}]: a reaction has this name: choose another")
                 self._asked[name] = quantity
         self._sizes = {name: value.shape for name, value in self._values().items()}
-        self.names = [column for name, shape in self._sizes.items() for column in self._columns(name, shape)]
+        self.names = [column for name, shape in self._sizes.items() for column in self._columns(name, shape)]  # of the columns
 
     def _columns(self, name: str, shape: tuple[int, ...]) -> list[str]:
         """Names of the columns of a number ``()`` or a vector ``(n,)``."""

@@ -96,10 +96,8 @@ class XdmfSeries:
                     known[id(V)] = numbering_of(V)
                 self._fields.append((u, centre, self._field(u, known[id(V)])))
         self._cells, self._nodes = self._mesh_tables(S)
-        #: Number of steps in the files.
-        self.n_steps = 0
-        #: End of the last kept step in the XDMF file, and whether the files contain more.
-        self._end, self._more = 0, False
+        self.n_steps = 0  # number of steps in the files
+        self._end, self._more = 0, False  # end of the last kept step in the XDMF file, and whether the files contain more
         try:
             if resume_at is None or not on_rank_0(self.comm, self._trouble, path.exists):
                 self._begin()

@@ -297,8 +297,7 @@ class Checkpoint(given.Sealed):
         self._state: State | None = None
         #: Whether steps have been made since the last write, and the loop whose caller still works on a step.
         self._unwritten, self._loop = False, None  # type: bool, object
-        #: Signals to end the run.
-        self.interruption = Interruption(finishing=True)
+        self.interruption = Interruption(finishing=True)  #: Signals to end the run.
 
     def begin(self, state: State) -> bool:
         """Resume from the file if it exists, and remove the incomplete file of a killed run (collective).

@@ -37,16 +37,12 @@ class ByFunction:
 
     Args:
         function: as declared.
-
-    Attributes:
-        at: argument of its last call since the last step, or None.
-        last: argument of its last call, or None.
     """
 
     def __init__(self, function: Callable[[float], Any]):
         self._function = function
-        self.at: float | None = None
-        self.last: float | None = None
+        self.at: float | None = None  # argument of its last call since the last step, or None
+        self.last: float | None = None  # argument of its last call, or None
 
     def __call__(self, at: float) -> None:
         """Set the load; InputError for a function that returns a value, which would be lost."""

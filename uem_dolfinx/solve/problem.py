@@ -216,15 +216,13 @@ class UnitedProblem(given.Sealed):
         options |= {} if self.linear is None else {"linear": self.linear}
         self.stage: Any = None  # the present ``solve.steps.stages.Stage``
         self.system = method(self.bodies, self.interfaces, self.solver, **options)
-        #: Length of time steps, with the history needed to control it.
-        self.step_control = StepControl()
+        self.step_control = StepControl()  #: Length of time steps, with the history needed to control it.
         self.progress = Progress()  # in steps and in load
         #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
         self.committed = np.array(u.x.array)
         #: Motions of the rigid targets in that state; None for targets that had not moved, and for meshes.
         self.motions = self.rigid_motions()
-        #: Norm of the largest forces of all steps, as far as they exceed rounding.
-        self.largest_forces: Norm = 0.0
+        self.largest_forces: Norm = 0.0  #: Norm of the largest forces of all steps, as far as they exceed rounding.
         #: State at the beginning of the last step, and ``led``: the start of its ramp, its fraction, and whether its load was controlled.
         from uem_dolfinx.solve.memory import Memory
 

@@ -54,8 +54,7 @@ class StepControl:
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
         self._cuts, self._read, self._longest_before, self.due, self.stretch, self.resolved = 0, False, np.inf, 0, 0.0, np.inf
         self.of_contact, self.shortest, self.accurate = False, np.inf, np.inf
-        #: History of the last attempt of this step, which failed.
-        self._failed: list[object] = []
+        self._failed: list[object] = []  # history of the last attempt of this step, which failed
 
     def begin(self, nominal: float) -> None:
         """Set the nominal length, with a warning if it differs from the length in a checkpoint."""

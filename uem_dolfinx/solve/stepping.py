@@ -235,8 +235,7 @@ def between_steps(
     told = comm.bcast(logger.isEnabledFor(logging.INFO))
     outer = progress.interruption, progress.end
     progress.interruption = Interruption() if checkpoint is None else checkpoint.interruption
-    #: this loop, for the checkpoint
-    loop = object()
+    loop = object()  # this loop, for the checkpoint
     if checkpoint is not None:
         progress.end = checkpoint.end
     try:

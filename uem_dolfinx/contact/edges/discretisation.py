@@ -174,8 +174,7 @@ NO_WAY = 1e6
 class EdgeTarget(MeshTarget):
     """The edges of a surface, as the target of one list of crossings, by its number."""
 
-    #: Crossings are found from lists, not by bounding boxes.
-    measures = False
+    measures = False  # crossings are found from lists, not by bounding boxes
 
     def __init__(self, crossings: Crossings, number: int):
         super().__init__(crossings.second.facets)

@@ -35,10 +35,8 @@ class Limits:
 
     def __init__(self, areas: Callable[[Array | None], Array], duration: Callable[[], float] | None):
         self.areas_of, self.duration = areas, duration
-        #: Whether friction acts for whole steps with its force at the end.
-        self.whole = False
-        #: Normal forces at which limits are fixed ``(n,)``, or None.
-        self._held: Array | None = None
+        self.whole = False  # whether friction acts for whole steps with its force at the end
+        self._held: Array | None = None  # normal forces at which limits are fixed ``(n,)``, or None
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set a law and the values of its parameter ``(n,)`` (collective)."""

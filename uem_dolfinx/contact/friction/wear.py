@@ -40,9 +40,6 @@ class Wear:
         lower: function that increases gaps by depths ``(n,)``; contactors must be placed again afterwards.
         name: of the contact, for messages.
 
-    Attributes:
-        k: coefficient at the contactors ``(n,)``.
-
     Raises:
         InputError, UserFunctionError: if contactors are points, or if a function of position is invalid.
     """
@@ -63,6 +60,7 @@ class Wear:
             raise InputError(f"{words} needs areas, and points have none: give facets")
         given.kind(words, k, not isinstance(k, fem.Function), "a number or a function of position")
         self._config, self._nodes, self._lower, self._name, self._warned = config, nodes, lower, name, False
+        #: coefficient at the contactors ``(n,)``.
         self.k = asked_at(config, nodes, words, k, given.NOT_NEGATIVE) if callable(k) else np.full(len(nodes), k)
         surface = TargetFacets(config, tag, "contactor")
         #: Integrals of the shape functions at the contactors ``(n,)``.

@@ -33,8 +33,7 @@ class FurtherPart(Contact):
     """Part of a contact, with arguments of its own in place of the contact's; ``order`` as in ``Traits``. Its results are the contact's."""
 
     is_further_part = True
-    #: Corners are contactors themselves, and contactors pass ends regularly.
-    sees_corners = watches_ends = False
+    sees_corners = watches_ends = False  # corners are contactors themselves, and contactors pass ends regularly
 
     def __init__(self, of: Contact, what: str, order: int, **how: Any):
         same = {name: getattr(of, name) for name in ("sliding", "normals", "max_penetration", "friction", "offset", "measure")}
@@ -114,8 +113,7 @@ class OfCrossings(Contact):
     kind = Edges
     _crossings: Crossings
     _number: int
-    #: See ``Traits``.
-    _order: int
+    _order: int  # see ``Traits``
 
     def _sides(self, config: Configuration) -> tuple[Indices, Target]:
         return self._crossings.nodes.astype(np.int32), EdgeTarget(self._crossings, self._number)

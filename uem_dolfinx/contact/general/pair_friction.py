@@ -39,8 +39,7 @@ class FrictionOfPairs:
     """
 
     def __init__(self, friction: dict[Any, Any]):
-        #: Friction of pairs that are not listed, zero by default.
-        self.others = as_law(given_friction(friction.get(None, 0.0)))
+        self.others = as_law(given_friction(friction.get(None, 0.0)))  # friction of pairs that are not listed, zero by default
         self.pairs = [(*self._pair(key), as_law(given_friction(value))) for key, value in friction.items() if key is not None]
         laws = [law for *_, law in self.pairs] + [self.others] * (None in friction)
         self.law = (laws or [self.others])[0]

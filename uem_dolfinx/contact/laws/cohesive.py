@@ -180,8 +180,7 @@ class Cohesive(given.Sealed):
             a viscosity with plastic unloading.
     """
 
-    #: Whether surfaces are bonded point to point.
-    bonds = True
+    bonds = True  #: Whether surfaces are bonded point to point.
 
     def __init__(
         self,

@@ -316,8 +316,7 @@ class Adhesion(given.Sealed):
         InputError, InputTypeError: for numbers that are not positive.
     """
 
-    #: Whether surfaces are bonded point to point.
-    bonds = False
+    bonds = False  #: Whether surfaces are bonded point to point.
 
     def __init__(self, energy: float, strength: float):
         self.energy = given.number("energy", energy, given.POSITIVE)

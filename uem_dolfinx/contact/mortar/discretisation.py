@@ -56,8 +56,7 @@ class Mortar(Contactors):
 
     traits = Traits(at_feet=False, pointwise=False, chained=True, two_pass=False)
 
-    #: Whether the last rows were made before any facets had faced each other in the step.
-    _afresh = False
+    _afresh = False  # whether the last rows were made before any facets had faced each other in the step
 
     def __init__(
         self, config: Configuration, nodes: Indices, target: Target, *, surface: TargetFacets, of_gaps: bool = False, **how: Any

@@ -31,9 +31,6 @@ class Seam:
         space: nodes of the displacement.
         nodes: owned contactor nodes ``(n,)``.
         seams: equations that make seams, or None.
-
-    Attributes:
-        sharing: number of contactors with the row of each ``(n,)``.
     """
 
     def __init__(self, space: Nodes, nodes: Indices, seams: Seams | None):
@@ -43,8 +40,7 @@ class Seam:
         kept[kept] = (np.bincount(group[kept]) > 1)[group[kept]]
         self._comm, self._n_owned, self._node = space.comm, space.n_owned, node[kept]
         _, self._group = np.unique(group[kept], return_inverse=True)
-        #: Whether there are any.
-        self.any = bool(kept.any())
+        self.any = bool(kept.any())  # whether there are any
         size = np.bincount(self._group)
         order = np.argsort(self._group, kind="stable")
         #: Contactors of each group, -1 for none.
@@ -56,7 +52,7 @@ class Seam:
         self._owned = int(np.searchsorted(self._local, space.n_owned))
         sharing = np.ones(space.n_owned)
         sharing[self._local[: self._owned]] = size[self._of_local[: self._owned]]
-        self.sharing: Array = sharing[nodes]
+        self.sharing: Array = sharing[nodes]  # number of contactors with the row of each ``(n,)``
 
     def sums(self, values: Array) -> Array:
         """Values at owned or local nodes ``(n_owned, ...)`` or ``(n_local, ...)``, with the sum of each group at all of it (collective)."""

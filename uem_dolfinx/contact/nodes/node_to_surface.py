@@ -47,8 +47,7 @@ class NodeToSurface(OnTarget):
     traits = Traits(at_feet=True, pointwise=True, chained=False, two_pass=True)
     #: Whether an end of the target holds contactors that first touch there, for all or for each ``(n,)``.
     ends_hold: bool | Bools = True
-    #: In place of ``ConcaveEdges``, see ``follow_by``.
-    _edges: Any = None
+    _edges: Any = None  # in place of ``ConcaveEdges``, see ``follow_by``
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)

@@ -63,8 +63,7 @@ class CohesiveInterface(SofteningInterface):
         n, g = len(self.nodes), self.config.gdim
         #: Derivatives of the bonds' forces by their equations, and without growth of damage ``(n, gdim, gdim)``.
         self._tangent = self._secant = np.zeros((n, g, g))
-        #: Openings at the first placement of this step ``(n, gdim)``.
-        self._first: Array | None = None
+        self._first: Array | None = None  # openings at the first placement of this step ``(n, gdim)``
         #: Parameter of friction of surfaces without cohesion ``(n,)``.
         self._mu: Array = np.zeros(n) if self.friction is None else self.friction.value
 

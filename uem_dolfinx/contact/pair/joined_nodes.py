@@ -43,8 +43,7 @@ class JoinedNodes(NodeToSurface):
         own: discretisations of the contacts.
     """
 
-    #: A ``JoinedTarget`` or ``JoinedRigid``.
-    target: Any
+    target: Any  # a ``JoinedTarget`` or ``JoinedRigid``
 
     def __init__(self, own: Sequence[NodeToSurface]):
         first = own[0]
@@ -54,8 +53,7 @@ class JoinedNodes(NodeToSurface):
         self.rows_of = [slice(a, b) for a, b in pairwise(ends.tolist())]
         surfaces = [getattr(one.target, "facets", one.target) for one in own]
         distinct: dict[int, Any] = {id(surface): surface for surface in surfaces}
-        #: Number of the surface of each contact.
-        self.surface_of = [list(distinct).index(id(surface)) for surface in surfaces]
+        self.surface_of = [list(distinct).index(id(surface)) for surface in surfaces]  # number of the surface of each contact
         #: Converts numbers of facets, ``alone`` on their surface and ``here``.
         self.numbers: Any = JoinedRigid([one.target for one in own], self.rows_of)
         target: Any = self.numbers

@@ -40,15 +40,13 @@ class LeakingInterface(Interface):
         InputError: if no contactor is at the inlet.
     """
 
-    #: Its forces do work.
-    works = True
+    works = True  # its forces do work
 
     def __init__(self, *args: Any, law: Leak, contact: Any, **how: Any):
         super().__init__(*args, **how)
         self._law, self._contact, config = law, contact, self.config
         inlet = surface_nodes(config, as_tag(law.inlet, config.mesh, (config.tdim - 1, 0), "inlet"))
-        #: Contactors at the inlet ``(n,)``.
-        self._inlet: Bools = np.isin(self.nodes, inlet)
+        self._inlet: Bools = np.isin(self.nodes, inlet)  # contactors at the inlet ``(n,)``
         if not reduced(config.comm, int(self._inlet.sum())):
             raise InputError(
                 f"contact '{self.name}': leak, no contactor is at the inlet: expected a part that meets the contactor's edge"

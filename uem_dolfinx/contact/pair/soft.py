@@ -113,8 +113,7 @@ class SoftInterface(Interface):
         #: ``(n,)``.
         self._at = self._multipliers = self._stiffness = self._area = np.zeros(n)
         self._holds: Bools = np.zeros(n, dtype=bool)
-        #: Whether the law has a slope at rest, which stops bodies that fall.
-        self._stops = True
+        self._stops = True  # whether the law has a slope at rest, which stops bodies that fall
         #: Gaps and multipliers that the last linearised problem predicts ``(n,)``, or None.
         self._predicted: tuple[Array, Array] | None = None
 

@@ -124,13 +124,11 @@ def exchange(state: PairState, violated: Violations) -> PairState:
 class Rule:
     """Rules for the exchange of violated contactors, from fast to safe."""
 
-    #: All of them: fast, but it may cycle.
-    ALL = 0
+    ALL = 0  # all of them: fast, but it may cycle
     #: Only the first in a fixed order: never cycles if the matrix between gaps and forces is a P-matrix (Murty, 1974,
     #: doi:10.1007/BF01580244).
     FIRST = 1
-    #: No exchange: even the last rule has cycled.
-    NONE = 2
+    NONE = 2  # no exchange: even the last rule has cycled
 
 
 class Pivoting:

@@ -41,8 +41,7 @@ class OnTarget:
     """
 
     traits: Traits
-    #: Which contactors are left to other equations, see ``leave``.
-    _leaves: Sequence[Callable[[FacetProjection], Bools]] = ()
+    _leaves: Sequence[Callable[[FacetProjection], Bools]] = ()  # which contactors are left to other equations, see ``leave``
 
     def __init__(
         self, config: Configuration, nodes: Indices, target: Target, *, free: Bools, sliding: str, thickness: float = np.inf,
@@ -55,8 +54,7 @@ class OnTarget:
         self.set(free=free)
         self.anchor: Projection | None = None
         self.asked = True
-        #: Whether small sliding renews its closest points in the next step.
-        self._renewing = False
+        self._renewing = False  # whether small sliding renews its closest points in the next step
         #: Last projection: positions of contactors and target, the anchor, and the result.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None
         #: The same where the anchor's closest points were found; from there a step after a failed attempt begins again.

@@ -18,8 +18,7 @@ from uem_dolfinx.contact.thermal.heat import Heat
 class SoftHeat(Heat):
     """Heat through one soft interface; arguments as for ``Heat``."""
 
-    #: The interface, a ``SoftInterface``.
-    pair: Any
+    pair: Any  # the interface, a ``SoftInterface``
     _of_gaps = (0, 1)
 
     def _state(self) -> tuple[Array, ...]:

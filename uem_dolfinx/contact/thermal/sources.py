@@ -22,8 +22,7 @@ class Source(Protocol):
     """Heat that enters both sides at contactors."""
 
     share: float
-    #: Whether it is the work of an electric current.
-    of_current: bool
+    of_current: bool  # whether it is the work of an electric current
 
     @property
     def lags(self) -> bool:

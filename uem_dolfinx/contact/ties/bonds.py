@@ -20,18 +20,13 @@ from uem_dolfinx.contact.ties.tied_rows import TiedRows
 
 
 class Bonds(Tie):
-    """Bonds of one interface; arguments as for ``Tie``.
-
-    Attributes:
-        bonded: contactors with bonds ``(n,)``.
-        holds: contactors whose bonds hold bodies that nothing else holds ``(n,)``.
-        multipliers: of the bonds' equations, their forces on the contactors ``(n, gdim)``.
-    """
+    """Bonds of one interface; arguments as for ``Tie``."""
 
     def __init__(self, *args: Any, **how: Any):
         super().__init__(*args, **how)
-        self.bonded: Bools = self.tied
-        self.holds: Bools = self.tied
+        self.bonded: Bools = self.tied  # contactors with bonds ``(n,)``
+        self.holds: Bools = self.tied  # contactors whose bonds hold bodies that nothing else holds ``(n,)``
+        #: of the bonds' equations, their forces on the contactors ``(n, gdim)``.
         self.multipliers: Array = np.zeros(self._left_out.shape)
 
     def _take_rows(self, rows: TiedRows, off: Bools) -> None:

@@ -58,8 +58,7 @@ class Preloaded(Tie):
         self.axis: Array = np.zeros(self.config.gdim)
         self.force, self.locked, self.opening, self.shortened = 0.0, False, 0.0, False
         self.along: Array = np.zeros(0)
-        #: Number of the leading row, -1 on other ranks, and the rank that has it.
-        self._lead, self._root = -1, 0
+        self._lead, self._root = -1, 0  # number of the leading row, -1 on other ranks, and the rank that has it
 
     # -- the axis and the leading row ------------------------------------------------------------------------------------
 

@@ -46,10 +46,8 @@ class WatchedContact(OfBothSides):
         """Begin the checks, when the problem is complete; ``overlaps`` as ``check_initial`` returns them (collective)."""
         self.taken, self._slipped, self._on, self._overlap = True, False, True, 0.0
         self.note_overlap(overlaps)
-        #: The reported convex corner of the target, which reduces the contact force.
-        self._corner: CornerInside | None = None
-        #: Contactors that were past an end of the target at the start ``(n,)``.
-        self.off_at_start: Bools = self.pair.off.copy()
+        self._corner: CornerInside | None = None  # the reported convex corner of the target, which reduces the contact force
+        self.off_at_start: Bools = self.pair.off.copy()  # contactors that were past an end of the target at the start ``(n,)``
 
     @property
     def initial_overlap(self) -> float:
@@ -137,8 +135,7 @@ class Watch:
 
     def __init__(self, contacts: Sequence[WatchedContact], rigid: Bools | None = None):
         self._contacts = contacts
-        #: Contactors of rigid bodies, a ``RigidSides``; None without rigid nodes.
-        self._rigid_sides: Any = None
+        self._rigid_sides: Any = None  # contactors of rigid bodies, a ``RigidSides``; None without rigid nodes
         if contacts and rigid is not None and reduced(contacts[0].config.comm, int(rigid.sum())):
             from uem_dolfinx.contact.warnings.rigid_sides import RigidSides
 

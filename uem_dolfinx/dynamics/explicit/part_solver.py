@@ -154,8 +154,7 @@ class MassSolver(PartSolver):
     G are terms of friction at active contactors.
     """
 
-    #: State of the values of M.
-    _state = -1
+    _state = -1  # state of the values of M
 
     def _unite(self, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
         """Factorise the united matrix at the coupled nodes (collective)."""
@@ -237,8 +236,7 @@ class Prediction:
     def __init__(self, problem: Any, system: Any, massive: Bools):
         self.problem, self.system, self.kept = problem, system, False
         self._massive, self._solver = massive, SurfaceSolver(problem.bodies.unknowns, "uem_prediction_")
-        #: State of the values of K whose columns at the surface are known.
-        self._state = -1
+        self._state = -1  # state of the values of K whose columns at the surface are known
         #: Writes the residual of the cells behind the surface; None if it is as well to write that of all.
         self._write: Callable[[PETSc.Vec], None] | None = None
 

@@ -103,12 +103,9 @@ class ExplicitStepper:
         if not problem.comm.allreduce(int(heavy.sum())):
             raise MassError("central differences need nodes with mass, and there are none: check the density")
         self._mass = m
-        #: United system that a step solves, and how its solution is predicted.
-        self.system, self.prediction = self._parts()
-        #: Length that the last refused step might have had.
-        self.limit = np.inf
-        #: Part of the critical step that resolves closed contacts.
-        self.part = 1.0
+        self.system, self.prediction = self._parts()  # united system that a step solves, and how its solution is predicted
+        self.limit = np.inf  # length that the last refused step might have had
+        self.part = 1.0  # part of the critical step that resolves closed contacts
         config = problem.config
         cell = compat.cell_name(config.mesh)
         self._vertices = compat.cell_dofs(config.V)[:, : len(forms.reference_topology(cell)[0])]
@@ -123,8 +120,7 @@ class ExplicitStepper:
         self.shortest, self.rate = np.inf, 0.0
         self._of_mesh = self._slopes(config.X)
         self._least = COLLAPSED * self._height(_inverse(self._of_mesh))
-        #: Whether accelerations may have strained cells much in the last step.
-        self.sudden = False
+        self.sudden = False  # whether accelerations may have strained cells much in the last step
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
 
     def _parts(self) -> tuple[Any, Any]:

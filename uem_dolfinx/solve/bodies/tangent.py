@@ -69,8 +69,7 @@ class Tangent:
         J, self._inputs = forms.with_derivatives(J)
         if J.empty():
             raise SpaceError("the residual F does not depend on u: build it from the same Function that the problem gets")
-        #: Whether K is the same for every u.
-        self.linear: bool = not any(f is u for f in self._inputs)
+        self.linear: bool = not any(f is u for f in self._inputs)  # whether K is the same for every u
         if self.given:
             self.linear = self.linear and not any(f is u for f in forms.with_derivatives(derivative)[1])
         self._dynamics, self._factor, self.points = dynamics, 0.0, points
@@ -79,14 +78,11 @@ class Tangent:
             self._form = forms.form(J)
         self._materials, self._unknowns = materials, config.unknowns
         self.K: PETSc.Mat = self._unknowns.create_matrix(self._form)
-        #: Components without Dirichlet condition ``(n_rows, gdim)``.
-        self._free: Bools = np.ones((0, 0), dtype=bool)
+        self._free: Bools = np.ones((0, 0), dtype=bool)  # components without Dirichlet condition ``(n_rows, gdim)``
         #: Mask of free components without stiffness ``(n_rows * gdim,)``; None if there are none on any rank.
         self.bare: Bools | None = None
-        #: Whether K has zeros on its diagonal, which is completed at prescribed components.
-        self._lacks = config.unknowns.mixed
-        #: Number of assemblies.
-        self.number = 0
+        self._lacks = config.unknowns.mixed  # whether K has zeros on its diagonal, which is completed at prescribed components
+        self.number = 0  # number of assemblies
 
     @property
     def completed(self) -> bool:

@@ -64,16 +64,12 @@ class FloatingBodies:
     Args:
         linear: equations of users, or None.
         far_apart: contacts that are not searched until bodies come near.
-
-    Attributes:
-        rigid: rigid motions of the bodies; None of a scalar field.
-        motions: rigid motions of the present step; None if conditions, springs and inertia hold all bodies.
     """
 
     def __init__(self, bodies: Bodies, pairs: Sequence[Interface], linear: UserRows | None, far_apart: FarApart):
         self._bodies, self._pairs, self._linear, self._far_apart = bodies, pairs, linear, far_apart
         config, dynamics = bodies.config, bodies.dynamics
-        self.rigid: RigidMotions | None = None
+        self.rigid: RigidMotions | None = None  # rigid motions of the bodies; None of a scalar field
         self._at_rest: RigidMotions | None = None
         self._in_motion: RigidMotions | None = None
         if config.moves:
@@ -84,13 +80,12 @@ class FloatingBodies:
                 # in a time step, inertia holds bodies with mass
                 moving = RigidMotions(config, free & ~dynamics.inert, finite)
                 self._in_motion = self._floating(moving)
-        self.motions = self._at_rest
+        self.motions = self._at_rest  # rigid motions of the present step; None if conditions, springs and inertia hold all bodies
         #: Motions that conditions and contacts leave open, held by supports ``(n_motions, k)``.
         self._open: Array = np.zeros((0, 0))
         #: Minus the displacement at the beginning of the step and minus the rigid motions since ``(n_local, gdim)``.
         self._went: Array = np.zeros((0, 0))
-        #: Sum of the forces at the beginning of the step; None until known.
-        self._loads: float | None = None
+        self._loads: float | None = None  # sum of the forces at the beginning of the step; None until known
         #: Open motions including those that only friction resists, if all contactors slip ``(n_motions, k)``.
         self._sliding: Array = np.zeros((0, 0))
 

@@ -46,9 +46,6 @@ class RigidMotions:
     Args:
         free: components without Dirichlet condition of the owned nodes ``(n_owned, gdim)``.
         finite: whether rotations of bodies are finite, not linearised.
-
-    Attributes:
-        share: largest force along an open motion relative to the sum of all forces, at the last call of ``load``.
     """
 
     def __init__(self, config: Configuration, free: Bools, finite: bool):
@@ -69,7 +66,7 @@ class RigidMotions:
         self._unheld: Any | None = None
         #: Velocities of the owned nodes in the modes of their bodies, constant for linearised rotations; None until needed.
         self._drawn: Array | None = None
-        self.share = 0.0
+        self.share = 0.0  # largest force along an open motion relative to the sum of all forces, at the last call of ``load``
 
     # -- motions ---------------------------------------------------------------------------------------------------------
 

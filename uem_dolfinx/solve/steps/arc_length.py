@@ -46,21 +46,17 @@ class ArcLength:
 
     Args:
         problem: with its method and load.
-
-    Attributes:
-        factor: the present load factor.
     """
 
     def __init__(self, problem: UnitedProblem):
         assert isinstance(problem.system, BodySystem)
         self._problem, self._system, self._bodies = problem, problem.system, problem.bodies
-        self.factor = 0.0
+        self.factor = 0.0  # the present load factor
         #: Number of the displacement's components on this rank, which come first in vectors.
         self._n = problem.config.n_owned * problem.config.gdim
         #: Direction of the last step over the length of this one, and energy to dissipate, or infinity without.
         self._direction, self._energy = np.zeros(self._n), np.inf
-        #: Displacement and load factor at the beginning of the step.
-        self._start, self._from = self._bodies.displacement(), 0.0
+        self._start, self._from = self._bodies.displacement(), 0.0  # displacement and load factor at the beginning of the step
         #: Change of the load factor in this iteration, and the residual's derivative with respect to it.
         self._change, self._slope = 0.0, problem.config.unknowns.vector()
         self.end_step, self.accelerate, self.forget = self._system.end_step, self._system.accelerate, self._system.forget

@@ -137,8 +137,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
         return
     if progress.factor != 0.0:
         problem.set_load(progress.factor)
-    #: load factor of the last unstable equilibrium
-    unstable: float | None = None
+    unstable: float | None = None  # load factor of the last unstable equilibrium
     while progress.factor < 1.0:
         done = progress.factor
         if progress.control.number >= way.most * steps:

@@ -197,8 +197,7 @@ class Stage:
     def __init__(self, problem: UnitedProblem, step: Step, end: float = 1.0):
         self._problem, self.step = problem, step
         progress, self._at = problem.progress, 0.0
-        #: Whether the step begins now; otherwise it was begun or completed before a checkpoint.
-        fresh = progress.ahead > 0
+        fresh = progress.ahead > 0  # whether the step begins now; otherwise it was begun or completed before a checkpoint
         if progress.ahead == 0 and progress.step != step.name:
             raise CheckpointError(
                 f"the state is one of the step '{progress.step}', which is '{step.name}' now: expected the same steps as before; go "

@@ -49,8 +49,7 @@ class Impacts:
 
     def __init__(self, problem: Any, pairs: list[Interface]):
         self._problem, self.dynamics, self.pairs = problem, problem.dynamics, pairs
-        #: Equations of users, and what they and ties have in common.
-        self._equations: tuple[Any, OverConstraints] | None = None
+        self._equations: tuple[Any, OverConstraints] | None = None  # equations of users, and what they and ties have in common
         with agreed(problem.comm):
             for pair in pairs:
                 _refuse(pair)

@@ -40,17 +40,11 @@ class OverConstraints:
     Args:
         pairs: of all contacts; ``mutual`` of their settings is set if surfaces are contactor and target of each other.
         linear: equations of users, or None.
-
-    Attributes:
-        shared: whether a node is a contactor of several pairs.
-        stacked: whether a node that is followed may itself be eliminated.
-        contestable: whether equations can conflict even if they do not follow each other in a ring.
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None):
         self._unknowns = config.unknowns
-        #: The restriction made last.
-        self._last: Restriction | None = None
+        self._last: Restriction | None = None  # the restriction made last
         # joined contacts are compared one by one
         whole, pairs = pairs, [one for pair in pairs for one in pair.members]
         surfaces, which = _surfaces(pairs)
@@ -65,7 +59,7 @@ class OverConstraints:
         found = np.append(meets.ravel(), shared)
         config.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.LOR)
         meets = found[:-1].reshape(meets.shape)
-        self.shared = bool(found[-1])
+        self.shared = bool(found[-1])  # whether a node is a contactor of several pairs
         # bodies that follow each other in one order never follow each other mutually
         ordered = np.array([pair.discretisation.traits.order for pair in pairs])
         one_order = (ordered[:, None] == ordered) & (ordered[:, None] != -1)
@@ -83,9 +77,11 @@ class OverConstraints:
                     f"{pair.name}: another contact has these surfaces as target and contactor: mortar is exact in one pass, so keep "
                     "one of the two contacts, or give both coupling='node_to_surface'"
                 )
+        #: whether a node that is followed may itself be eliminated.
         self.stacked = bool(meets.any()) or any(
             pair.discretisation.traits.chained or (pair.tie is not None and pair.tie.chained) for pair in whole
         )
+        #: whether equations can conflict even if they do not follow each other in a ring.
         self.contestable = self.shared or any(pair.discretisation.setting.prescribed for pair in whole)
         if any(_united_fields(pair) for pair in pairs):
             # rows contain temperatures of both sides, which may be prescribed
