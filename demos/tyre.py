@@ -57,13 +57,7 @@ problem = uem.UnitedProblem(
 
 # %%
 density = rubber.energy(u) / E
-look = {
-    "field": density,
-    "label": "strain energy density / E",
-    "percentiles": (0, 99),
-    "cells": False,
-    "view": (0.5, -1.2, 0.3),
-}
+look = {"field": density, "label": "strain energy density / E", "percentiles": (0, 99), "cells": False, "view": (0.5, -1.2, 0.3)}
 run = uem.load_steps(problem, args.steps)
 start, rows = time.perf_counter(), [{"d": 0.0, "force": 0.0, "patch": 0.0, "p_max": 0.0, "newton": 0, "cg": 0}]
 for step in uem.animate(args.film, problem, run, frames_per_second=3, **look) if args.film else run:

@@ -42,11 +42,7 @@ from benchmarks.problems import bar_impact, cattaneo, hertz_answer, hertz_cylind
 from benchmarks.signorini import signorini
 
 args = common.arguments(
-    __doc__,
-    sizes=4,
-    runs=5,
-    problems="signorini,hertz_cylinder,hertz_penalty,cattaneo,bar_impact",
-    methods=",".join(methods.ALL),
+    __doc__, sizes=4, runs=5, problems="signorini,hertz_cylinder,hertz_penalty,cattaneo,bar_impact", methods=",".join(methods.ALL)
 )
 # the indenter's overlap at the start is meant
 logging.getLogger("uem_dolfinx").setLevel(logging.ERROR)

@@ -40,10 +40,7 @@ TESTS = thresholds.REPOSITORY / "tests"
 #: Seconds that a run may take; a test that goes on for ever has noticed nothing.
 LONGEST = 240
 #: Thresholds that no test notices yet: a list that may only become shorter.
-UNNOTICED = {
-    "FAR",
-    "KEPT",
-}
+UNNOTICED = {"FAR", "KEPT"}
 
 
 @dataclass(frozen=True)

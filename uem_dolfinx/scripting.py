@@ -21,12 +21,7 @@ from uem_dolfinx.geometry.tags import Part, Tag, as_tag, locate_dofs
 from uem_dolfinx.parallel import agreed
 
 
-def dirichlet(
-    V: fem.FunctionSpace,
-    tag: Part,
-    component: int | None = None,
-    value: Any = 0.0,
-) -> fem.DirichletBC:
+def dirichlet(V: fem.FunctionSpace, tag: Part, component: int | None = None, value: Any = 0.0) -> fem.DirichletBC:
     """Prescribe the displacement, or one component of it, at all nodes of a part of the mesh (collective).
 
         uem.dirichlet(V, tags["edge"], 1, lambda x, t: 0.1 * t * np.sin(np.pi * x[0]))

@@ -104,12 +104,7 @@ def row(mesh: Any, tags: Any, degree: int, method: str, spacing: float, exact: f
         times = [perf_counter() - start]
         force, rms = measured(contact)[:2]
         found.append(
-            {
-                "unknowns": len(problem.u.x.array),
-                "method": method,
-                "parameter": parameter,
-                "error_force": abs(force / exact - 1),
-            }
+            {"unknowns": len(problem.u.x.array), "method": method, "parameter": parameter, "error_force": abs(force / exact - 1)}
             | {"error_pressure": rms, "solves": solves, "seconds": times}
         )
     if not found:

@@ -124,12 +124,7 @@ class Scene:
 
 
 def scene(
-    comm: MPI.Comm,
-    cell: str,
-    bodies: Sequence[Body],
-    *,
-    pose: Callable[[Array], Array] = lambda x: x,
-    shuffle: int | None = None,
+    comm: MPI.Comm, cell: str, bodies: Sequence[Body], *, pose: Callable[[Array], Array] = lambda x: x, shuffle: int | None = None
 ) -> Scene:
     """Merge bodies into one mesh (collective).
 

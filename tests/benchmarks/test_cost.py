@@ -157,13 +157,7 @@ def test_first_run_tells_what_it_compiles(tmp_path):
     where, said = environment(XDG_CACHE_HOME=str(tmp_path)), []
     # UFL has more than one name for a form, and takes a few runs to have met them
     for _ in range(4):
-        done = subprocess.run(
-            [sys.executable, "-c", FIRST],
-            env=where,
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
+        done = subprocess.run([sys.executable, "-c", FIRST], env=where, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
         said.append([line for line in done.stderr.splitlines() if "compiling" in line])
     assert len(said[0]) == 2 and "the tangent" in said[0][0] and "the residual" in said[0][1]

@@ -393,11 +393,7 @@ def test_explicit_steps_have_none():
     parts = r.held(), r.part(1)
     ball, mass = uem.Ball(*parts, r.at(2.25)), uem.lumped_mass(r.V, 1.0)
     explicit = uem.Dynamics(mass, scheme=uem.CentralDifferences())
-    refused(
-        uem.InputError,
-        "couplings need nodes with mass to go with",
-        lambda: r.problem(*parts, ball, dynamics=explicit),
-    )
+    refused(uem.InputError, "couplings need nodes with mass to go with", lambda: r.problem(*parts, ball, dynamics=explicit))
 
 
 def test_joints_that_contradict_conditions():

@@ -95,9 +95,7 @@ def test_a_motion_by_expressions():
         assert led.displacement[0] == pytest.approx(there(0.2 * step.factor)[0], rel=1e-12)
     for wrong in (2.0 * d, b.u[0]):
         refused(
-            uem.InputTypeError,
-            "expression of Constants",
-            lambda: uem.RigidCoupling(b.right, b.point, motion=(wrong, None, None)),
+            uem.InputTypeError, "expression of Constants", lambda: uem.RigidCoupling(b.right, b.point, motion=(wrong, None, None))
         )
 
 

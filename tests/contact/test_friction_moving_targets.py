@@ -20,8 +20,7 @@ MU = 0.3
 
 
 @pytest.mark.parametrize(
-    ("coupling", "centre"),
-    [("node_to_surface", (0.0, 0.0)), ("node_to_surface", (1.1, 0.05)), ("mortar", (1.0, 0.0))],
+    ("coupling", "centre"), [("node_to_surface", (0.0, 0.0)), ("node_to_surface", (1.1, 0.05)), ("mortar", (1.0, 0.0))]
 )
 def test_a_turntable_under_a_block_that_is_held(coupling, centre):
     """A few iterations a step while slip spreads; at the end each contactor is dragged along the table's motion under it."""

@@ -48,12 +48,7 @@ def test_an_edge_slides_along_a_groove(coupling, angles):
 
 @pytest.mark.parametrize(
     ("coupling", "angle", "roof"),
-    [
-        ("mortar", 30.0, False),
-        ("mortar", 35.0, True),
-        ("node_to_surface", 55.0, False),
-        ("node_to_surface", 45.0, True),
-    ],
+    [("mortar", 30.0, False), ("mortar", 35.0, True), ("node_to_surface", 55.0, False), ("node_to_surface", 45.0, True)],
 )
 def test_a_keel_slides_along_its_groove(coupling, angle, roof):
     """Flank on flank, or astride of a roof, it is mu W / sin(angle) as soon as what moves across has settled."""

@@ -93,10 +93,7 @@ class Limited:
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize(
     ("cell", "degree", "rigid"),
-    [
-        ("quadrilateral", 1, False),
-        *(slow(*one) for one in (("triangle", 2, False), ("hexahedron", 1, True))),
-    ],
+    [("quadrilateral", 1, False), *(slow(*one) for one in (("triangle", 2, False), ("hexahedron", 1, True)))],
 )
 def test_coulomb_with_a_limit(cell, degree, rigid, coupling):
     """It is Coulomb's where little presses and Tresca's where much does."""

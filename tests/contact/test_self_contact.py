@@ -172,9 +172,7 @@ def test_not_declared():
     root = s.tag("root", 0, at(0, -0.4))
     bcs = [uem.dirichlet(V, root)]
     refused(
-        uem.SurfaceError,
-        ("one body", "self_contact"),
-        lambda: uem.UnitedProblem(F, u, bcs=bcs, contacts=[uem.GeneralContact()]),
+        uem.SurfaceError, ("one body", "self_contact"), lambda: uem.UnitedProblem(F, u, bcs=bcs, contacts=[uem.GeneralContact()])
     )
     contact = uem.GeneralContact(self_contact=[root])
     problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])

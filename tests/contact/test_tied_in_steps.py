@@ -11,19 +11,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import (
-    arch,
-    at,
-    blocks,
-    box,
-    clamp,
-    highest,
-    linear,
-    lowest,
-    modulus,
-    scene,
-    st_venant,
-)
+from helpers import arch, at, blocks, box, clamp, highest, linear, lowest, modulus, scene, st_venant
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms

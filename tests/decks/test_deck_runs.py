@@ -180,12 +180,7 @@ KINDS = ["*HEAT TRANSFER, STEADY STATE\n", "*HEAT TRANSFER\n0.01, 50.\n", "*COUP
 @pytest.mark.parametrize("step", KINDS)
 def test_heat_through_a_joint(folder, step):
     """Resistances in series, at once or after a long time; bodies that expand into each other press as stiffly as two springs."""
-    text = two(
-        law="*GAP CONDUCTANCE\n3.0\n",
-        material=STEEL + HEAT.format(1.0),
-        step=f"*STEP\n{step}{ENDS}",
-        held=BOTH,
-    )
+    text = two(law="*GAP CONDUCTANCE\n3.0\n", material=STEEL + HEAT.format(1.0), step=f"*STEP\n{step}{ENDS}", held=BOTH)
     deck = ran(folder, text)
     flux = 200.0 / (2 * 0.5 + 1 / 3.0)
     assert deck.temperature(121) == pytest.approx(100.0 + 0.5 * flux, rel=1e-6)
@@ -200,13 +195,7 @@ def test_gaps_that_conduct(folder):
     for part, hot in ((0.5, True), (2.0, False)):
         gap = part * 1e-4 * np.sqrt(6.0)
         step = f"*STEP\n*HEAT TRANSFER, STEADY STATE\n{ENDS}"
-        text = two(
-            law="*GAP CONDUCTANCE\n3.0\n",
-            gap=gap,
-            material=STEEL + HEAT.format(1.0),
-            step=step,
-            held=BOTH,
-        )
+        text = two(law="*GAP CONDUCTANCE\n3.0\n", gap=gap, material=STEEL + HEAT.format(1.0), step=step, held=BOTH)
         assert (ran(folder, text).temperature(121) > 101.0) is hot
 
 
@@ -220,11 +209,7 @@ def test_heat_in_steps_of_time(folder):
     grown = [0.02 * 1.5**k for k in range(4)]
     assert taken[:4] == pytest.approx(grown) and max(taken) == pytest.approx(0.1) and sum(taken) == pytest.approx(1.0)
     assert len(taken) == 4 + int(np.ceil((1.0 - sum(grown)) / 0.1))
-    exact = two(
-        material=STEEL + HEAT.format(1.0),
-        step=f"*STEP\n*HEAT TRANSFER\n0.1, 1.0000004\n{ENDS}",
-        held=BOTH,
-    )
+    exact = two(material=STEEL + HEAT.format(1.0), step=f"*STEP\n*HEAT TRANSFER\n0.1, 1.0000004\n{ENDS}", held=BOTH)
     assert len(list(uem.read_deck(written(folder, exact), COMM).run())) == 10
 
 

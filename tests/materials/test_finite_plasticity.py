@@ -12,22 +12,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from helpers import at, clamp, highest, rotation
-from plastic_scenes import (
-    FY,
-    MU,
-    NU,
-    E,
-    H,
-    block,
-    deform,
-    reaction,
-    skewed,
-    spread,
-    tangent_in_flow,
-    to_flow,
-    vector,
-    wiggle,
-)
+from plastic_scenes import FY, MU, NU, E, H, block, deform, reaction, skewed, spread, tangent_in_flow, to_flow, vector, wiggle
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -39,10 +24,7 @@ TABLE = [(0.0, FY), (0.02, 1.2 * FY), (0.1, 1.2 * FY), (0.4, 2.0 * FY)]
 LAWS = {
     "linear": ((FY, H), lambda p: FY + H * p),
     "perfect": ((FY,), lambda p: FY + 0 * p),
-    "voce": (
-        (FY, uem.Voce(1.5 * FY, 0.1, 2 * FY)),
-        lambda p: FY * (1 + 1.5 * (1 - np.exp(-p / 0.1)) + 2 * p),
-    ),
+    "voce": ((FY, uem.Voce(1.5 * FY, 0.1, 2 * FY)), lambda p: FY * (1 + 1.5 * (1 - np.exp(-p / 0.1)) + 2 * p)),
     "table": ((TABLE, 3 * FY), lambda p: np.interp(p, *np.transpose(TABLE)) + 3 * FY * np.maximum(p - 0.4, 0)),
 }
 

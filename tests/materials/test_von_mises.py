@@ -14,22 +14,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from helpers import at, clamp, highest, run
-from plastic_scenes import (
-    FY,
-    MU,
-    NU,
-    E,
-    H,
-    block,
-    deform,
-    matrix,
-    reaction,
-    skewed,
-    spread,
-    tangent_in_flow,
-    vector,
-    wiggle,
-)
+from plastic_scenes import FY, MU, NU, E, H, block, deform, matrix, reaction, skewed, spread, tangent_in_flow, vector, wiggle
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms

@@ -245,8 +245,7 @@ def test_prescribed_normal_of_a_contactor(target):
 
 
 @pytest.mark.parametrize(
-    "backend,options",
-    [("hypre", {"pc_type": "hypre"}), ("mumps", {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"})],
+    "backend,options", [("hypre", {"pc_type": "hypre"}), ("mumps", {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"})]
 )
 def test_missing_backend(monkeypatch, backend, options):
     monkeypatch.setattr(f"uem_dolfinx.algebra.options.has_{backend}", lambda: False)

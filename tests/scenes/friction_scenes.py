@@ -209,11 +209,7 @@ def keel(
     bottom, surface = s.tag("bottom", 0, at(2, -1.0)), s.tag("groove", 0, at(2, 0.0))
     edge, top = s.tag("keel", 1, at(2, 0.0)), s.tag("top", 1, at(2, 1.0))
     contact = uem.Contact(edge, surface, friction=mu, coupling=coupling)
-    bcs = [
-        *clamp(V, bottom),
-        *clamp(V, surface),
-        fem.dirichletbc(driver, fem.locate_dofs_topological(V, 2, top.entities)),
-    ]
+    bcs = [*clamp(V, bottom), *clamp(V, surface), fem.dirichletbc(driver, fem.locate_dofs_topological(V, 2, top.entities))]
     problem = uem.UnitedProblem(linear(u, 1.0), u, bcs=bcs, contacts=[contact])
     made = Blocks(s, V, u, bottom, surface, edge, top, len(high.x))
     return Keel(made, problem, contact, driver, np.radians(angles))

@@ -95,16 +95,7 @@ class Impact:
     """A plastic block that flies aslant onto a plastic one, which a moving foot and a growing load drive against it."""
 
     def __init__(
-        self,
-        comm=COMM,
-        *,
-        scheme=None,
-        kind="plane_strain",
-        plastic=True,
-        moving=True,
-        dynamic=True,
-        max_iterations=4,
-        time=0.0,
+        self, comm=COMM, *, scheme=None, kind="plane_strain", plastic=True, moving=True, dynamic=True, max_iterations=4, time=0.0
     ):
         cell = "quadrilateral"
         low = box(cell, [0.0, 0.0], [2.0, 1.0], [6, 3])

@@ -28,9 +28,5 @@ class Bar:
         damping = (lambda rate: eta * ufl.inner(ufl.grad(rate), ufl.grad(v)) * ufl.dx) if eta else None
         self.dynamics = uem.Dynamics(uem.lumped_mass(self.V, DENSITY), gravity=gravity, contactors=contactors, damping=damping)
         self.problem = uem.UnitedProblem(
-            law.residual(self.u, v) * ufl.dx,
-            self.u,
-            contacts=[self.floor],
-            dynamics=self.dynamics,
-            load=load,
+            law.residual(self.u, v) * ufl.dx, self.u, contacts=[self.floor], dynamics=self.dynamics, load=load
         )

@@ -248,9 +248,7 @@ def test_functions_of_loads_refused():
     raised(uem.InputError, "the value of a Constant in load", lambda: next(uem.load_steps(arch.problem)))
     arch = Arch(lambda a: {a.q: lambda s: 1 / 0})
     raised(
-        uem.UserFunctionError,
-        "the load of a Constant at 1 raised ZeroDivisionError",
-        lambda: next(uem.load_steps(arch.problem)),
+        uem.UserFunctionError, "the load of a Constant at 1 raised ZeroDivisionError", lambda: next(uem.load_steps(arch.problem))
     )
 
 

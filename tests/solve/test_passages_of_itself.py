@@ -61,11 +61,7 @@ class Needle:
         return [lowest(COMM, x[below & (np.abs(X[:, 1] - y) < 1e-9), 1]) for y in (1.4, 1.1)]
 
 
-KINDS = [
-    ("quadrilateral", 1),
-    slow("quadrilateral", 2),
-    slow("triangle", 2),
-]
+KINDS = [("quadrilateral", 1), slow("quadrilateral", 2), slow("triangle", 2)]
 
 
 @pytest.mark.parametrize(("cell", "degree"), KINDS)

@@ -92,15 +92,7 @@ class UnitedRows:
         ConflictError: for equations without a component to eliminate, and for equations that follow from others or contradict them.
     """
 
-    def __init__(
-        self,
-        config: Configuration,
-        sides: RightSides,
-        rows: GivenRows,
-        item: Ints,
-        free: Bools,
-        contactors: Bools,
-    ):
+    def __init__(self, config: Configuration, sides: RightSides, rows: GivenRows, item: Ints, free: Bools, contactors: Bools):
         self._config, self.sides = config, sides
         self._make(rows, item, free, contactors)
         self._halo = Halo(config, self.equations.followed)

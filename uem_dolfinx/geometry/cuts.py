@@ -149,7 +149,5 @@ def _followed(
     both = one.rows[np.isin(one.rows, doubled).all(axis=1)]
     middles = one.middles[np.isin(one.middles, doubled)]
     return replace(
-        one,
-        rows=np.concatenate([one.rows, np.sort(moved[both], axis=1)]),
-        middles=np.concatenate([one.middles, moved[middles]]),
+        one, rows=np.concatenate([one.rows, np.sort(moved[both], axis=1)]), middles=np.concatenate([one.middles, moved[middles]])
     )

@@ -22,10 +22,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 @contextmanager
 def recording(
-    problem: UnitedProblem,
-    *,
-    scratch: str | Path | None = None,
-    controls: Sequence[AnyControl] | AnyControl = (),
+    problem: UnitedProblem, *, scratch: str | Path | None = None, controls: Sequence[AnyControl] | AnyControl = ()
 ) -> Iterator[History]:
     """Record all steps of a problem in a ``with`` block, for gradients through their history (collective).
 

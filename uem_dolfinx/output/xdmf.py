@@ -74,12 +74,7 @@ class XdmfSeries:
     """
 
     def __init__(
-        self,
-        path: Path,
-        mesh: Any,
-        nodal: Sequence[fem.Function],
-        cellwise: Sequence[fem.Function],
-        resume_at: int | None = None,
+        self, path: Path, mesh: Any, nodal: Sequence[fem.Function], cellwise: Sequence[fem.Function], resume_at: int | None = None
     ):
         self.path, self.comm, self._mesh = path, mesh.comm, mesh
         self._numbers = path.with_suffix(".bin")

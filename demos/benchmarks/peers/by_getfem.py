@@ -57,9 +57,4 @@ def solve(scene: Hertz, runs: int, timeout: float, rtol: float) -> Answer:
     # GetFEM has its own numbers of the nodes
     here, there = (np.lexsort(np.round(x.T / scene.h, 6)) for x in (scene.x[scene.nodes(scene.contactor)], np.array(answer["x"])))
     pressures = scene.E * np.array(answer["forces"])[there] / scene.sizes(scene.contactor)[here]
-    return Answer(
-        answer["seconds"],
-        answer["iterations"],
-        scene.parts * scene.E * answer["P"],
-        float(pressures.max()),
-    )
+    return Answer(answer["seconds"], answer["iterations"], scene.parts * scene.E * answer["P"], float(pressures.max()))

@@ -31,11 +31,7 @@ def prescribed(surface, component, value):
         "constrained": [i == component for i in range(3)],
         "value": [value if i == component else None for i in range(3)],
     }
-    return {
-        "python_module": "assign_vector_variable_process",
-        "kratos_module": "KratosMultiphysics",
-        "Parameters": parameters,
-    }
+    return {"python_module": "assign_vector_variable_process", "kratos_module": "KratosMultiphysics", "Parameters": parameters}
 
 
 def settings():

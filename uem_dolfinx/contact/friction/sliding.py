@@ -187,12 +187,7 @@ class Sliding:
         return replace(state, friction=now)
 
     def violated(
-        self,
-        violated: Violations,
-        state: PairState,
-        seen: Traction,
-        rounding: tuple[Array, float],
-        du: Array | None,
+        self, violated: Violations, state: PairState, seen: Traction, rounding: tuple[Array, float], du: Array | None
     ) -> stick_slip.FrictionViolations:
         """Add violations of the friction conditions (collective).
 

@@ -330,10 +330,7 @@ class Mortar(Contactors):
             push = np.where(is_covered, np.where(taken, pushed[:, 1], pushed[:, 0]) / scale, 1.0)
             frictionless = along / slope[:, None]
             whole = self.elimination.total(own[f, i], itself[f, i, None])[:, 0]
-            means = [
-                terms_of(own, own, -coefficients[..., None], other),
-                terms_of(own[e], at.opposite, followed),
-            ]
+            means = [terms_of(own, own, -coefficients[..., None], other), terms_of(own[e], at.opposite, followed)]
             whole = np.where(is_covered, whole, 1.0)
             r, t, w = self.elimination.at_owners(means, whole)
             near = nearest.nodes[alone][k, a], nearest.weights[alone][k, a]

@@ -154,13 +154,7 @@ class Interface:
         return gone or moved
 
     def violated(
-        self,
-        gap: Array,
-        seen: Traction,
-        force_rounding: Array,
-        gap_rounding: float,
-        swept: bool,
-        du: Array | None = None,
+        self, gap: Array, seen: Traction, force_rounding: Array, gap_rounding: float, swept: bool, du: Array | None = None
     ) -> active_set.Violations:
         """Contactors whose gaps and forces violate the contact conditions (collective).
 
@@ -181,13 +175,7 @@ class Interface:
         pulled = np.where(self.trial.in_corner, 0.0, seen.lam)
         rounding = max(gap_rounding, active_set.GAP_ROUNDING * self.config.size)
         violated = active_set.find_violations(
-            self.trial,
-            gap,
-            pulled,
-            off,
-            self.kinematics.movable & ~apart,
-            force_rounding=force_rounding,
-            gap_rounding=rounding,
+            self.trial, gap, pulled, off, self.kinematics.movable & ~apart, force_rounding=force_rounding, gap_rounding=rounding
         )
         if self.friction is None:
             return violated

@@ -90,14 +90,7 @@ def deep_enough(span: float, gdim: int) -> float:
 
 
 def find_violations(
-    state: PairState,
-    gap: Array,
-    lam: Array,
-    off: Bools,
-    movable: Bools,
-    *,
-    force_rounding: Array | float,
-    gap_rounding: float,
+    state: PairState, gap: Array, lam: Array, off: Bools, movable: Bools, *, force_rounding: Array | float, gap_rounding: float
 ) -> Violations:
     """Find the contactors that violate the contact conditions.
 

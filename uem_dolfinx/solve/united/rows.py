@@ -193,13 +193,7 @@ class BodyState(IterationState):
     solved: Solved | None = None
 
     def with_rows(
-        self,
-        rows: Rows,
-        solved: Solved | None,
-        trial: Restriction,
-        added: PETSc.Mat | None,
-        held: PETSc.Vec | None,
-        active: int,
+        self, rows: Rows, solved: Solved | None, trial: Restriction, added: PETSc.Mat | None, held: PETSc.Vec | None, active: int
     ) -> BodyState:
         """The same bodies with other rows; a known solution holds if no body has come loose, or was loose, by these (collective)."""
         alike = reduced(rows.test.comm, int(np.array_equal(rows.test.free, self.test.free)), op=MPI.LAND)
