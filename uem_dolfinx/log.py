@@ -48,11 +48,7 @@ _stages: dict[str, None] = {}
 
 
 class timed(ContextDecorator):  # noqa: N801
-    """Time a stage of the method, as a context or a decorator; ``dolfinx.common.list_timings`` shows it as ``~UEM: stage``.
-
-    Args:
-        stage: name of the stage, e.g. ``"search"``.
-    """
+    """Time a stage of the method, as ``"search"``, as a context or a decorator; ``list_timings`` shows it as ``~UEM: search``."""
 
     def __init__(self, stage: str):
         self._stage = stage
@@ -100,11 +96,7 @@ def timing(stage: str) -> tuple[int, float]:
 
 @contextmanager
 def compiling(what: str) -> Iterator[None]:
-    """Time the compilation of forms, and log it if it happens: it takes a while, in the first run only.
-
-    Args:
-        what: compiled forms in words, e.g. ``"the residual"``.
-    """
+    """Time the compilation of forms, as ``"the residual"``, and log it if it happens: it takes a while, in the first run only."""
     ffcx = logging.getLogger("ffcx")
     said = False
 

@@ -196,12 +196,7 @@ class Exchange:
 
     @classmethod
     def to(cls, comm: MPI.Comm, rank: Ints) -> Exchange:
-        """Exchange of rows that go to one rank each.
-
-        Args:
-            comm: communicator.
-            rank: receiving rank of each row ``(n,)``, -1 for no rank.
-        """
+        """Exchange of rows that go to one ``rank (n,)`` each, -1 for no rank."""
         if comm.size == 1:
             return cls(comm, [(rank >= 0).nonzero()[0]])
         order = np.argsort(rank, kind="stable")

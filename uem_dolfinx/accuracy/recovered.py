@@ -228,12 +228,7 @@ def _in_cells(form: ufl.Form) -> ufl.Form:
 
 
 class _Patches:
-    """Polynomials around the vertices of a mesh (collective).
-
-    Args:
-        mesh: the mesh.
-        degree: of the polynomials.
-    """
+    """Polynomials of a degree around the vertices of a mesh (collective)."""
 
     def __init__(self, mesh: Any, degree: int):
         self._nodes = Nodes(compat.function_space(mesh, 1))

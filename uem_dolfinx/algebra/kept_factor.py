@@ -91,11 +91,7 @@ LEAST_ACCURATE = 1e-3
 
 
 class KeptFactor(Returning):
-    """The last factorisation of ``Q'KP``, with data of its matrix.
-
-    Args:
-        space: the space that K acts on.
-    """
+    """The last factorisation of ``Q'KP`` in a space, with data of its matrix."""
 
     def __init__(self, space: Nodes):
         self.space = space

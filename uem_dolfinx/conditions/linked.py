@@ -19,12 +19,7 @@ MOST_CLOSINGS = 12
 
 
 class Linked:
-    """Joints and springs of couplings with a common vector of motions.
-
-    Args:
-        links: joints, springs and relations, all of whose ends are among the couplings.
-        sets: nodes of the couplings.
-    """
+    """Joints, springs and relations, all of whose ends are among the couplings, with a common vector of motions."""
 
     def __init__(self, couplings: Sequence[RigidCoupling], links: Sequence[Link | Relation], sets: RigidSets):
         self._couplings, self._links, self._sets = couplings, [one for one in links if isinstance(one, Link)], sets

@@ -141,11 +141,7 @@ def blended_friction(contact: Contact, to: Field | FrictionLaw, share: Callable[
 
 
 def refuse_ramp(what: str, *fields: Field) -> None:
-    """Refuse Functions at the ends of a ramp, which every step reads anew.
-
-    Raises:
-        InputError: names it.
-    """
+    """Refuse Functions at the ends of a ramp, which every step reads anew, by an InputError that names it."""
     if any(isinstance(f, fem.Function) for f in fields):
         raise InputError(
             f"{what} is a Function, which a Step does not ramp: expected numbers or functions of position; or change its values between "

@@ -57,11 +57,7 @@ class Nodes:
         self.size = float(np.linalg.norm(bounds[self.gdim :] + bounds[: self.gdim]))
 
     def modes(self, centred: bool = False) -> Array:
-        """Zero-energy fields at the owned nodes: a constant of each component ``(n_owned, n_modes, block)``.
-
-        Args:
-            centred: whether all are scaled to one size (collective if so).
-        """
+        """Constants of each component at owned nodes ``(n_owned, n_modes, block)``, ``centred`` ones of one size (collective)."""
         return np.broadcast_to(np.eye(self.block), (self.n_owned, self.block, self.block))
 
     def to_global(self, nodes: npt.NDArray[np.integer]) -> Ints:
@@ -88,12 +84,7 @@ class Nodes:
         return forms.create_matrix(a)
 
     def complete(self, K: PETSc.Mat, free: Bools) -> None:
-        """Set zero diagonal entries of K for fixed components, which P eliminates, to its largest entry (collective).
-
-        Args:
-            K: just assembled.
-            free: components without Dirichlet condition ``(n_owned, block)``.
-        """
+        """Set zero diagonal entries of K to its largest, but for ``free (n_owned, block)`` components (collective)."""
         diagonal = K.getDiagonal()
         largest = diagonal.norm(PETSc.NormType.INFINITY) or 1.0
         diagonal.array[~free.ravel() & (diagonal.array_r == 0.0)] = largest
@@ -177,11 +168,7 @@ def described(place: Array) -> str:
 
 
 def check_places(mesh: Any) -> None:
-    """Refuse a mesh with nodes whose coordinates are not finite (collective).
-
-    Raises:
-        MeshError: with number in the mesh's input and coordinates of the first such node.
-    """
+    """Refuse a mesh with nodes whose coordinates are not finite by a MeshError that names the first one (collective)."""
     x, number = mesh.geometry.x[:, : mesh.geometry.dim], np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)
     bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
     order, last = bad[np.argsort(number[bad])], np.iinfo(np.int64).max
@@ -195,12 +182,7 @@ def check_places(mesh: Any) -> None:
 
 
 class Halo:
-    """Communication with the owners of global nodes that this rank needs (collective).
-
-    Args:
-        space: the space.
-        nodes: global numbers ``(m,)``.
-    """
+    """Communication with the owners of global ``nodes (m,)`` that this rank needs (collective)."""
 
     def __init__(self, space: Nodes, nodes: Ints):
         self._space, self._size = space, len(nodes)

@@ -18,11 +18,7 @@ LEAST_POINTS = 5
 
 
 class OfPoints:
-    """Converts distance, gradient and hessian of a surface, all of one kind, to functions of points ``(n, gdim)``.
-
-    Args:
-        distance: function of ``(3, n)`` or ``(n, gdim)``; returns ``(n,)``.
-    """
+    """Converts functions of ``(3, n)`` or ``(n, gdim)`` of a surface, all of one kind, to functions of points ``(n, gdim)``."""
 
     def __init__(self, distance: Callable[[Array], Any]):
         self._distance = distance

@@ -14,12 +14,7 @@ from uem_dolfinx.parallel import ask_together
 
 
 class SharedTarget:
-    """A target of the user's in a problem: what its functions raise on one rank is raised on all; else it is that target.
-
-    Args:
-        target: not a mesh.
-        comm: of the problem.
-    """
+    """A target of the user's in a problem: what its functions raise on one rank is raised on all; else it is that target."""
 
     def __init__(self, target: Target, comm: MPI.Comm):
         self._target, self._comm = target, comm

@@ -40,12 +40,7 @@ def exterior_facets(config: Configuration) -> Tag:
 
 
 class Areas:
-    """Integrals of the shape functions over a surface, in the reference and the current configuration.
-
-    Args:
-        tag: of the surface, or of points, which have no area.
-        facets: of the surface, if available.
-    """
+    """Integrals of the shape functions over a surface, zero for points, in the reference and the current configuration."""
 
     def __init__(self, config: Configuration, tag: Tag, facets: TargetFacets | None = None):
         self._config, self._tag, self._made = config, tag, facets

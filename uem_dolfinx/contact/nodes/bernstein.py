@@ -50,12 +50,7 @@ class Family:
     of_facet: Bools  # whether the child is the middle of a facet and the parent the middle of an edge ``(k,)``
 
     def control_gaps(self, projection: Projection, usable: Bools) -> ControlGaps:
-        """Terms that are valid for the current projection (collective).
-
-        Args:
-            projection: of the contactors.
-            usable: contactors above the target and not held in a corner ``(n,)``; only their gaps count.
-        """
+        """Terms for this projection, with gaps of ``usable (n,)`` contactors, above the target and in no corner (collective)."""
         p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
         rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
         seen = self.config.from_owners(self.nodes, rows, self.parent)

@@ -177,11 +177,7 @@ ACROSS = 1e-3
 
 
 class ConcaveEdges:
-    """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its concave edges.
-
-    Args:
-        of: discretisation of the contactors, on such a target.
-    """
+    """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its concave edges."""
 
     def __init__(self, of: OnTarget):
         self._of, self.config, self.target = of, of.config, cast("MeshTarget", of.target)

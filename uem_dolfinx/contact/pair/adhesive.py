@@ -21,12 +21,7 @@ from uem_dolfinx.contact.seam.state import PairState
 
 
 class AdhesiveInterface(SofteningInterface):
-    """Contactors that are attracted by their target; other arguments as for ``Interface``.
-
-    Args:
-        law: attraction by the gap.
-        contact: that it belongs to, for ``measured_areas`` and ``leads``.
-    """
+    """Contactors attracted by a law of the gap, on areas of a ``contact``; other arguments as for ``Interface``."""
 
     def __init__(self, *args: Any, law: Adhesion, contact: Any, **how: Any):
         super().__init__(*args, **how)

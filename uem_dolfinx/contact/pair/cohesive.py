@@ -49,12 +49,7 @@ def growth_of(state: Array) -> tuple[bool, bool]:
 
 
 class CohesiveInterface(SofteningInterface):
-    """Contactors with bonds, made by ``unite``; other arguments as for ``Interface``.
-
-    Args:
-        law: of the bonds.
-        contact: that it belongs to, for ``surface`` and the present load factor.
-    """
+    """Contactors with bonds of a law, made by ``unite``, at a ``contact``'s load factor; other arguments as for ``Interface``."""
 
     def __init__(self, *args: Any, law: Cohesive, contact: Any, **how: Any):
         super().__init__(*args, **how)

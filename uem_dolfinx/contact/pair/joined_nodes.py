@@ -37,11 +37,7 @@ from uem_dolfinx.parallel import reduced
 
 
 class JoinedNodes(NodeToSurface):
-    """Implements ``Discretisation``: contactors of several contacts (collective).
-
-    Args:
-        own: discretisations of the contacts.
-    """
+    """Implements ``Discretisation``: contactors of several contacts, from the discretisation of each (collective)."""
 
     target: Any  # a ``JoinedTarget`` or ``JoinedRigid``
 
@@ -95,12 +91,7 @@ class JoinedNodes(NodeToSurface):
 
 
 class JoinedLaw:
-    """Friction laws of several contacts, all of one kind, as one ``FrictionLaw``.
-
-    Args:
-        laws: of the contacts.
-        label: number of the contact of each contactor ``(n,)``.
-    """
+    """Friction laws of several contacts, all of one kind, as one; ``label (n,)`` is the number of each contactor's contact."""
 
     def __init__(self, laws: Sequence[FrictionLaw], label: Ints):
         self.laws, self.field = list(laws), laws[0].field
@@ -121,12 +112,7 @@ class JoinedLaw:
 
 
 class JoinedSliding(Sliding):
-    """Friction of the contactors of several contacts.
-
-    Args:
-        own: friction of each contact.
-        discretisation: of all of them.
-    """
+    """Friction of the contactors of several contacts, from the friction of each and the discretisation of all."""
 
     def __init__(self, own: Sequence[Sliding], discretisation: JoinedNodes):
         first, label = own[0], discretisation.setting.label

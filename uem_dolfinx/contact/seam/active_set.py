@@ -138,12 +138,7 @@ class Pivoting:
         self._seen: set[Hashable] = set()
 
     def choose(self, count: int, state: Hashable) -> int:
-        """The rule for the next exchange.
-
-        Args:
-            count: number of violated contactors.
-            state: identifies the state of all contactors.
-        """
+        """The rule for the next exchange of ``count`` violated contactors; ``state`` identifies the state of all contactors."""
         if count < self._fewest:
             self._fewest, self._tries, self._rule, self._seen = count, PATIENCE, Rule.ALL, set()
         elif self._rule < Rule.FIRST:

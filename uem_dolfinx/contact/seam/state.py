@@ -121,11 +121,7 @@ class PairState:
         )
 
     def to_checkpoint(self, keys_of: Renumber) -> dict[str, npt.NDArray[Any]]:
-        """The attributes by name (collective).
-
-        Args:
-            keys_of: function from facet numbers to keys independent of the partition ``(k,)``.
-        """
+        """The attributes by name; ``keys_of`` turns facet numbers into keys independent of the partition (collective)."""
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "friction"}
         for name in ("bond", "heat", "law_gap", "cohesion", "wet", "damping"):
             if getattr(self, name) is None:
@@ -138,12 +134,7 @@ class PairState:
 
     @classmethod
     def from_checkpoint(cls, kept: Mapping[str, npt.NDArray[Any]], facets_of: Renumber) -> PairState:
-        """The state from the arrays of ``to_checkpoint`` (collective).
-
-        Args:
-            kept: arrays by name.
-            facets_of: function from these keys to present facet numbers ``(k,)``.
-        """
+        """The state from the arrays of ``to_checkpoint``; ``facets_of`` turns keys into present facet numbers (collective)."""
         arrays = {name: _renumbered(name, np.array(array), facets_of) for name, array in kept.items()}
         of_friction = {name: array for name, array in arrays.items() if name.startswith(OF_FRICTION)}
         friction = (

@@ -67,12 +67,7 @@ class Flow(Protocol):
 
 
 class FrictionalHeat:
-    """Work of friction of the present step over the step's duration; its derivatives are neglected.
-
-    Args:
-        heat: whose field it enters.
-        share: part that enters the contactor.
-    """
+    """Work of friction in a step over its duration, without derivatives; a ``share`` of it enters the contactor."""
 
     lags, of_current = True, False
 
@@ -111,12 +106,7 @@ class FrictionalHeat:
 
 
 class JouleHeat:
-    """Currents times jumps of the potential. A perfect conductance has no jump, and makes no heat.
-
-    Args:
-        currents: conductances of the potential.
-        share: part that enters the contactor.
-    """
+    """Currents times jumps of the potential, a ``share`` of which enters the contactor; perfect conductances make no heat."""
 
     of_current = True
 

@@ -274,11 +274,7 @@ def warn_of_slipped(pair: Interface, before: Bools, areas: Array) -> bool:
 
 
 def check_new(contacts: Sequence[Any]) -> None:
-    """Refuse contacts that already belong to a problem, or occur twice in the list.
-
-    Raises:
-        SpaceError: naming the first such contact.
-    """
+    """Refuse contacts that already belong to a problem, or occur twice in the list, by a SpaceError that names the first one."""
     for i, contact in enumerate(contacts):
         if contact.taken or any(contact is other for other in contacts[:i]):
             where = "belongs to another problem" if contact.taken else f"is contacts[{i}] and occurs earlier in the list"

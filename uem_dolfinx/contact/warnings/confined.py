@@ -36,11 +36,7 @@ HELD = 1e-6
 
 
 class Confined:
-    """Bodies that Dirichlet conditions and declared contacts may confine on all sides (collective).
-
-    Args:
-        contacts: of the problem, placed, each with ``contactor``, ``target``, ``pair``, ``on`` and ``name``.
-    """
+    """Bodies that Dirichlet conditions and placed contacts may confine on all sides (collective)."""
 
     def __init__(self, contacts: Sequence[Any]):
         self._contacts, self._config = contacts, contacts[0].config

@@ -25,11 +25,7 @@ class Meeting:
 
 
 class EdgesInside:
-    """Edges of two surfaces of 3D bodies (collective).
-
-    Args:
-        meeting: the surfaces.
-    """
+    """Edges of two surfaces of 3D bodies (collective)."""
 
     def __init__(self, meeting: Meeting):
         self._meeting = meeting

@@ -32,12 +32,7 @@ EQUALLY_LONG = 1e-3
 
 
 class RigidSides:
-    """Nodes of a problem that couplings or Dirichlet conditions make rigid, and the contacts with such contactors (collective).
-
-    Args:
-        contacts: of the problem, each with ``contactor``, ``target``, ``name`` and ``pair``.
-        rigid: the nodes ``(n_owned,)``.
-    """
+    """Nodes that couplings or Dirichlet conditions make ``rigid (n_owned,)``, and contacts with such contactors (collective)."""
 
     def __init__(self, contacts: Sequence[Any], rigid: Bools):
         self._contacts: list[OfBothSides] = list(contacts)

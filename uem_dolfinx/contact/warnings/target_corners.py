@@ -69,12 +69,7 @@ class CornerInside:
 
 
 class TargetCorners:
-    """Convex corners of targets, and the contactors' surfaces that they may penetrate (collective).
-
-    Args:
-        pairs: interfaces with equations at nodes, treated together.
-        tags: of the contactors' facets of each.
-    """
+    """Convex corners of targets, and the contactors' surfaces, with ``tags``, that they may penetrate (collective)."""
 
     def __init__(self, pairs: Sequence[Interface], tags: Sequence[Tag]):
         self.pairs, self.whole = pairs, pairs[0].whole

@@ -126,12 +126,7 @@ class WatchedContact(OfBothSides):
 
 
 class Watch:
-    """Joint checks of all contacts of a complete problem after every step (collective).
-
-    Args:
-        contacts: of the problem, which have begun.
-        rigid: nodes that move as rigid bodies ``(n_owned,)``; None without such nodes.
-    """
+    """Joint checks of all contacts after every step; ``rigid (n_owned,)`` nodes move as rigid bodies (collective)."""
 
     def __init__(self, contacts: Sequence[WatchedContact], rigid: Bools | None = None):
         self._contacts = contacts

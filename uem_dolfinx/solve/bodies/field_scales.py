@@ -61,12 +61,7 @@ def driving(bodies: Any, test: Restriction, rhs: PETSc.Vec, du: PETSc.Vec) -> fl
 
 
 class FieldScales:
-    """Sizes of the terms in the equations of a mixed problem (collective).
-
-    Args:
-        unknowns: rows of K.
-        tangent: K, not yet assembled.
-    """
+    """Sizes of the terms in the equations of a mixed problem, from a tangent that is not yet assembled (collective)."""
 
     def __init__(self, unknowns: Unknowns, tangent: Tangent):
         self._unknowns, self._tangent = unknowns, tangent

@@ -359,12 +359,7 @@ class RigidMotions:
         )
 
     def thrown(self, ways: Array, most: float) -> ThrownBodyError:
-        """The error for a body that contact has pushed by ``ways (n_owned, gdim)`` and no longer holds (collective).
-
-        Args:
-            ways: displacements of the owned nodes.
-            most: largest displacement that is accepted.
-        """
+        """The error for a body that contact has pushed by ``ways (n_owned, gdim)``, above ``most``, and holds no more (collective)."""
         size, own = np.linalg.norm(ways, axis=1), self._body[: self.config.n_owned]
         far = np.zeros(self.count)
         np.maximum.at(far, own, size)

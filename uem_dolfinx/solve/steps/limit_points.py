@@ -26,12 +26,7 @@ WAYS_ON = "prescribe a displacement, or use load_steps(..., arc_length=True); wh
 
 
 class LimitPoint:
-    """Data of a load step that has finally failed, before the committed state is restored (collective).
-
-    Args:
-        problem: after the last attempt.
-        arc: whether steps of given arc length were taken.
-    """
+    """Data of a failed load step, or step of an ``arc``, before the committed state is restored (collective)."""
 
     def __init__(self, problem: UnitedProblem, arc: bool):
         self._problem, self._arc, self._motions = problem, arc, problem.rigid_motions()
