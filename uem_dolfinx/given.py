@@ -270,7 +270,7 @@ class Sealed:
 
     SETTABLE: ClassVar[Mapping[str, Callable[[Any], Any] | None]] = {}
     _made = False
-    _told: Mapping[str, Any] = {}  # arguments as given, where attributes of these names hold something else, for ``repr``
+    _shown: Mapping[str, Any] = {}  # arguments as given, where attributes of these names hold something else, for ``repr``
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Seal an object at the end of its outermost ``__init__``."""
@@ -289,7 +289,7 @@ class Sealed:
 
     def __repr__(self) -> str:
         """Its class, with the arguments that it was made with, as far as they are not the defaults."""
-        shows, kept = [], self.__dict__ | dict(self._told)
+        shows, kept = [], self.__dict__ | dict(self._shown)
         for name, parameter in inspect.signature(type(self)).parameters.items():
             value = kept.get(name, kept.get(f"_{name}", parameter.default))
             usual = value is parameter.default or (np.ndim(value) == 0 and value == parameter.default)

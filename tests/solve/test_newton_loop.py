@@ -10,7 +10,8 @@ from petsc4py import PETSc
 
 import uem_dolfinx as uem
 from uem_dolfinx.solve.bodies.bodies import MOST_PAST
-from uem_dolfinx.solve.united.newton import FORCING, Increment, IterationState, LinearisedProblem, solve_united
+from uem_dolfinx.solve.united.equilibrium import IterationState
+from uem_dolfinx.solve.united.newton import FORCING, Increment, LinearisedProblem, solve_united
 
 
 def vector(value):

@@ -355,7 +355,7 @@ class Spring(Link):
         free_length: float | None = None,
     ):
         super().__init__(a, b)
-        self._told = {"points": points, "free_length": free_length}
+        self._shown = {"points": points, "free_length": free_length}
         self.stiffness = given.number("stiffness", stiffness, given.POSITIVE)
         if points is None and (a is None or b is None):
             raise InputError("points of a Spring to the ground: expected the positions of both ends, on a and on b")

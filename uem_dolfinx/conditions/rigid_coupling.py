@@ -89,7 +89,7 @@ class RigidCoupling(given.Sealed):
         given.kind("motion", motion, is_list, f"a list of {n} items, {words}")
         if len(motion) != n:
             raise InputError(given.sentence("motion", motion, f"{n} items, {words}"))
-        self._told = {"motion": motion if any(one is not None for one in motion) else None, "inertia": inertia}
+        self._shown = {"motion": motion if any(one is not None for one in motion) else None, "inertia": inertia}
         #: Values of the prescribed components by their number.
         self.prescribed = {i: _checked_motion(f"motion[{i}]", v) for i, v in enumerate(motion) if v is not None}
         #: Force, moment and prescribed motion as declared, by name.

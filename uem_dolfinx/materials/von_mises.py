@@ -130,7 +130,7 @@ class VonMises(given.Sealed):
         self._points, self._pressure_points = (QuadraturePoints(self.mesh, self.cells, one) for one in degrees)
         self.handed = {"E": E, "nu": nu, "yield_stress": yield_stress, "hardening": hardening}
         self.handed["kinematic_hardening"] = kinematic_hardening
-        self._told = self.handed | {"cells": cells}
+        self._shown = self.handed | {"cells": cells}
         self._curve: YieldCurve  # yield stress over peeq; with a table, the yield curve of the layers
         self._layers: Layers | None = None
         self._read_parameters(E, nu, yield_stress, hardening, kinematic_hardening)

@@ -20,7 +20,7 @@ from benchmarks.rivals.pushed import PushedSystem
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.errors import ConvergenceError, SpaceError
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.united.newton import InEquilibrium, IterationState
+from uem_dolfinx.solve.united.equilibrium import InEquilibrium, IterationState
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.bodies import find_bodies

@@ -20,7 +20,7 @@ from benchmarks.rivals.pushed import PushedSystem
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.log import timed
-from uem_dolfinx.solve.united.newton import InEquilibrium, IterationState
+from uem_dolfinx.solve.united.equilibrium import InEquilibrium, IterationState
 from uem_dolfinx.geometry.projection import FacetProjection, Projection
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.facets import TargetFacets

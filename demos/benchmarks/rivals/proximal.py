@@ -22,7 +22,7 @@ from petsc4py import PETSc
 from benchmarks.rivals.penalty import Ints, NodePoints, PenaltySystem, Springs, _past_the_end
 from uem_dolfinx.errors import SpaceError
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.united.newton import InEquilibrium, IterationState
+from uem_dolfinx.solve.united.equilibrium import InEquilibrium, IterationState
 
 Array = np.ndarray
 #: Each proximal step is so many times as long as the one before.

@@ -13,7 +13,8 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.equilibrium import InEquilibrium, IterationState
+from uem_dolfinx.solve.united.newton import Increment, LinearisedProblem
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver

@@ -27,7 +27,8 @@ from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.checks import refuse_other_fields
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.steps.dissipation import Dissipation, advise, refuse_other_laws
-from uem_dolfinx.solve.united.newton import Increment, InEquilibrium, Iteration, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.equilibrium import InEquilibrium, IterationState
+from uem_dolfinx.solve.united.newton import Increment, Iteration, LinearisedProblem
 from uem_dolfinx.solve.united.rows import BodyState
 from uem_dolfinx.solve.united.system import BodySystem
 

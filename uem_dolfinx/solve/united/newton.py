@@ -14,18 +14,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Ints
 from uem_dolfinx.errors import ConvergenceError
 from uem_dolfinx.log import logger, say
-from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
+from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.bodies.field_scales import Norm, driving, first, ratio, worst
 from uem_dolfinx.solve.bodies.tangent import not_finite
 from uem_dolfinx.solve.rigid.unheld import no_precision, unheld
+from uem_dolfinx.solve.united.equilibrium import Equilibrium, InEquilibrium, IterationState
 
-#: A residual that keeps this part of its norm twice has met its rounding.
-#: [heuristic; norm of the residual; test_trust.py::test_converged_means_converged]
-STALLED = 0.5
 #: Shortest step of the line search. [bound; halvings of a step; -]
 SHORTEST_SEARCH = 1.0 / 64
 #: Longest step where forces drive the bodies on. [bound; doublings of a step; -]
@@ -40,12 +36,6 @@ FORCING = 1e-4
 #: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
 #: [convention; norm of the residual; test_newton.py::test_the_last_solve_is_as_accurate_as_convergence_asks]
 ACCURACY_AT_THE_END = 0.1
-#: A residual above this part of the forces that are told from rounding is no rounding, however far a loose body has flown.
-#: [bound; norm of the forces; test_trust.py::test_converged_means_converged]
-LARGEST_ROUNDING = 1e-4
-
-#: Whether the norm of a residual, relative to a norm of forces and to its rounding, is an equilibrium.
-InEquilibrium = Callable[[Norm, Norm, Norm], bool]
 
 
 @dataclass(frozen=True)
@@ -59,24 +49,6 @@ class Iteration:
     linear_iterations: int  # of the solves that followed; 0 if the step had converged
     step_length: float  # of the line search in the step to this iteration
     exchanges: int = 0  # further solves with the same tangent, each with another active set
-
-
-@dataclass(frozen=True)
-class IterationState:
-    """A state of the united system as the loop sees it."""
-
-    trial: Restriction  # P and c, by which the bodies move
-    test: Restriction  # Q, which transfers forces; the same object as P unless trial and test rows of a coupling differ
-    residual: PETSc.Vec  # ``Q'F``, the out-of-balance forces
-    norm: Norm  # its norm
-    scale: Norm  # norm of the forces at work
-    rounding: Norm  # norm below which a force is rounding of the displacement
-    gap: float  # largest gap of an active contactor, a length
-    active: int  # number of active contactors over all ranks
-    changed: bool  # whether contactors have changed their constraints because of their positions
-    right: bool  # whether all contactors satisfy the contact conditions with the present forces
-    closed: bool  # whether gaps and Dirichlet conditions are met
-    in_contact: bool  # whether there are contacts at all
 
 
 class LinearisedProblem(NamedTuple):
@@ -199,74 +171,39 @@ def solve_united(
         InvertedElementError: if even the shortest step turns a cell inside out.
     """
     history: list[Iteration] = []
-    start: Norm = 0.0
-    norm: Norm = 0.0
-    left: Norm = 0.0
-    within: Norm = np.inf
-    stalled: int | Ints = 0
-    norms, length = bodies.unknowns.norms, 1.0
-
-    def rounding_of_all(rounding: Norm, times: int) -> Norm:
-        # a stagnating residual is at the rounding level of laws that use the deformation gradient
-        more = np.where(stalled >= times, bodies.strain_rounding(), 0.0) if np.any(stalled >= times) else 0.0
-        return np.maximum(np.maximum(rounding, left), more)
-
-    def bounded(rounding: Norm, forces: Norm) -> Norm:
-        # a large rounding is bounded: by the forces, by its value at the start, and by rounding of displacements of the model's size
-        if not np.any(rounding > within):
-            return rounding
-        of_model = FORCE_ROUNDING / np.finfo(float).eps * bodies.strain_rounding()
-        return np.minimum(rounding, np.maximum(np.maximum(within, LARGEST_ROUNDING * forces), of_model))
-
-    def in_equilibrium(norm: Norm, scale: Norm, rounding: Norm) -> bool:
-        forces = np.maximum(scale, start)
-        return bool(np.all(norm <= np.maximum(rtol * forces, bounded(rounding_of_all(rounding, 1), forces))))
-
+    equilibrium, norms, length = Equilibrium(bodies, rtol, forces_before), bodies.unknowns.norms, 1.0
     method.place()
     if not bodies.assemble():
         remedy = "check loads, material parameters and the initial displacement for NaN and division by zero"
         raise not_finite(bodies, "at the start of the step", remedy)
     for k in range(max_iterations + 1):
-        with _told(history):
-            state = method.assemble_constraints(in_equilibrium)
-        if k == 0:
-            # a displacement that returns to zero keeps the rounding of its former size
-            start, left, within = state.norm, np.minimum(state.rounding, rtol * forces_before), state.rounding
-        forces = np.maximum(state.scale, start)
-        if k > 0 and state.right and not state.changed and method.return_to_targets(rtol * first(forces)):
-            bodies.assemble()
-            with _told(history):
-                state = method.assemble_constraints(in_equilibrium)
-        steady = state.right and not state.changed
-        stalled = np.where(state.norm > STALLED * norm, stalled + 1, 0) if k > 0 and not state.changed else 0
-        norm, rounding, small = state.norm, rounding_of_all(state.rounding, 2), rtol * forces
-        if np.any((small < norm) & (norm <= rounding)) and (k > 0 or np.any(np.greater(forces_before, 0.0))):
-            # rounding is accepted if the residual is small relative to real forces, or without forces: only after the first solve
-            real = np.maximum(bodies.above_rounding(state.in_contact), forces_before)
-            excused = np.where(real > 0, np.minimum(rounding, LARGEST_ROUNDING * real), bounded(rounding, forces))
-            small = np.where((small < norm) & (norm <= rounding), excused, small)
-        converged = steady and state.closed and bool(np.all(norm <= small))
-        hidden = steady and np.all(norm <= np.maximum(small, rounding)) and np.any((stalled >= 2) & (small < norm))
-        flown = np.atleast_1d((stalled >= 2) & (np.maximum(small, bounded(rounding, forces)) < norm) & (norm <= rounding))
-        if converged or hidden or flown.any() or k == max_iterations:
-            history.append(Iteration(ratio(norm, forces), state.gap, state.active, state.changed, 0, length))
+        with _with_history(history):
+            state = method.assemble_constraints(equilibrium.holds)
+            steady = state.right and not state.changed
+            if k > 0 and steady and method.return_to_targets(rtol * first(equilibrium.forces(state.scale))):
+                bodies.assemble()
+                state = method.assemble_constraints(equilibrium.holds)
+        verdict = equilibrium.judge(state)
+        if verdict.ends or k == max_iterations:
+            history.append(Iteration(ratio(state.norm, verdict.forces), state.gap, state.active, state.changed, 0, length))
             _report(history, verbose)
-            if converged:
+            if verdict.converged:
                 return history
-            if hidden:
-                raise no_precision(*worst(norm, rounding, real))
-            if flown.any():
-                error = unheld(bodies, int(flown.argmax()), history[-1].residual)
+            if verdict.hidden:
+                raise no_precision(*worst(state.norm, verdict.rounding, verdict.real))
+            if verdict.flown.any():
+                error = unheld(bodies, int(verdict.flown.argmax()), history[-1].residual)
                 # a shorter step may keep bodies in contact
                 raise ConvergenceError(str(error), history) if state.in_contact and bodies.config.moves else error
             break
         # the residual at the beginning of a step does not include prescribed increments and gaps
-        relative = ratio(norm, forces) if k > 0 else 1.0
-        with _told(history):
-            problem, step, solves, exchanges = _solve_linearised(method, state, k, rtol * first(forces), relative, check_signals)
+        relative = ratio(state.norm, verdict.forces) if k > 0 else 1.0
+        with _with_history(history):
+            wanted = rtol * first(verdict.forces)
+            problem, step, solves, exchanges = _solve_linearised(method, state, k, wanted, relative, check_signals)
         driving = np.maximum(norms(problem.rhs), norms(step.rhs))
-        within = np.maximum(within, LARGEST_ROUNDING * driving) if k == 0 else within
-        residual = ratio(driving, np.maximum(forces, driving if k == 0 else 0.0))
+        equilibrium.drive(driving)
+        residual = ratio(driving, np.maximum(verdict.forces, driving if k == 0 else 0.0))
         changed = state.changed or exchanges > 0
         history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
         _report(history, verbose)
@@ -280,7 +217,7 @@ def solve_united(
 
 
 @contextmanager
-def _told(history: list[Iteration]) -> Iterator[None]:
+def _with_history(history: list[Iteration]) -> Iterator[None]:
     """Attach the history to convergence errors."""
     try:
         yield

@@ -23,7 +23,7 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.parallel import agree, reduced
 from uem_dolfinx.solve.bodies.tangent import contact_curvature, together
-from uem_dolfinx.solve.united.newton import IterationState
+from uem_dolfinx.solve.united.equilibrium import IterationState
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.condensed import Solved

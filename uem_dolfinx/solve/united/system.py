@@ -28,8 +28,9 @@ from uem_dolfinx.solve.rigid.first_touch import nodes_beside, touch_ahead, way_a
 from uem_dolfinx.solve.rigid.floating import FloatingBodies
 from uem_dolfinx.solve.rigid.unheld import refuse_bare
 from uem_dolfinx.solve.united import rows as united_rows
+from uem_dolfinx.solve.united.equilibrium import InEquilibrium, IterationState
 from uem_dolfinx.solve.united.exchanges import Exchanges, count
-from uem_dolfinx.solve.united.newton import FORCING, Increment, InEquilibrium, IterationState, LinearisedProblem
+from uem_dolfinx.solve.united.newton import FORCING, Increment, LinearisedProblem
 from uem_dolfinx.solve.united.normal_return import move_back
 from uem_dolfinx.solve.united.rows import BodyState, OverConstraints, Rows, make_rows
 
