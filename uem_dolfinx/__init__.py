@@ -71,7 +71,6 @@ from uem_dolfinx import errors
 from uem_dolfinx.algebra.options import multigrid_options, saddle_options
 from uem_dolfinx.compat import function_space
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.contact.laws.coulomb import Coulomb, Tresca
 from uem_dolfinx.contact.results import Balance, Resultant
 from uem_dolfinx.errors import (
@@ -111,7 +110,6 @@ from uem_dolfinx.log import timing, timings
 from uem_dolfinx.materials.elastic import Elastic, LinearElastic, NeoHooke, StVenantKirchhoff
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.stepping import LoadStep
-from uem_dolfinx.solve.steps.dissipation import Dissipation
 from uem_dolfinx.solve.steps.load_steps import load_steps
 
 if _TYPE_CHECKING:
@@ -122,6 +120,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.conditions.equation import Equation, MeanMotion, periodic
     from uem_dolfinx.conditions.joints import Ball, Hinge, Slider, Spring
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
+    from uem_dolfinx.contact.general.general import GeneralContact
     from uem_dolfinx.contact.laws.cohesive import BenzeggaghKenane, Cohesive, Power
     from uem_dolfinx.contact.laws.conductance import Conductance
     from uem_dolfinx.contact.laws.law import OfTemperature
@@ -157,6 +156,7 @@ if _TYPE_CHECKING:
     from uem_dolfinx.solve.modes import Vibrations, modes
     from uem_dolfinx.solve.settings import Newton
     from uem_dolfinx.solve.stepping import TimeStep
+    from uem_dolfinx.solve.steps.dissipation import Dissipation
     from uem_dolfinx.solve.steps.stages import Step
     from uem_dolfinx.solve.steps.time_steps import time_steps
 
@@ -167,8 +167,9 @@ _LATER = {
         "accuracy.adapt": "Adaptation adapt", "accuracy.estimate": "ErrorEstimate error_estimate ErrorLimit",
         "accuracy.goal": "GoalError goal_error", "conditions.at_points": "PointLoad PointSpring",
         "conditions.equation": "Equation periodic MeanMotion", "conditions.joints": "Ball Hinge Slider Spring",
-        "conditions.rigid_coupling": "RigidCoupling", "contact.laws.cohesive": "Cohesive BenzeggaghKenane Power",
-        "contact.laws.conductance": "Conductance", "contact.laws.law": "OfTemperature", "contact.laws.leak": "Leak",
+        "conditions.rigid_coupling": "RigidCoupling", "contact.general.general": "GeneralContact",
+        "contact.laws.cohesive": "Cohesive BenzeggaghKenane Power", "contact.laws.conductance": "Conductance",
+        "contact.laws.law": "OfTemperature", "contact.laws.leak": "Leak",
         "contact.laws.soft": "SoftContact Exponential PowerLaw Adhesion", "contact.laws.stribeck": "Stribeck Thirion ViscousFriction",
         "contact.preload": "Preload", "decks.deck": "Deck", "decks.reading": "read_deck", "dynamics.inertia": "Dynamics",
         "dynamics.mass": "Mass consistent_mass lumped_mass nodal_mass",
@@ -181,7 +182,8 @@ _LATER = {
         "output.results": "HistoryWriter ResultsWriter", "output.surfaces": "SurfaceWriter",
         "restart.checkpoint": "Checkpoint read_checkpoint write_checkpoint", "restart.state": "State",
         "scripting": "assemble_matrix assemble_vector form dirichlet ds dx integrate interpolate", "solve.modes": "Vibrations modes",
-        "solve.settings": "Newton", "solve.stepping": "TimeStep", "solve.steps.stages": "Step", "solve.steps.time_steps": "time_steps",
+        "solve.settings": "Newton", "solve.stepping": "TimeStep", "solve.steps.dissipation": "Dissipation",
+        "solve.steps.stages": "Step", "solve.steps.time_steps": "time_steps",
     }.items()
     for name in names.split()
 }  # fmt: skip

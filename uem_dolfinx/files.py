@@ -23,11 +23,8 @@ from uem_dolfinx.parallel import agree, agreed
 
 T = TypeVar("T")
 
-#: Bytes that MPI-IO gets at once, because it counts them in C's int. [format; bytes; -]
+#: Bytes that are written or read in one call: Linux transfers less than 2 GiB. [format; bytes; -]
 PIECE = 2**30
-#: Longest path as given: Open MPI's MPI-IO overruns a buffer of 256 bytes, in which endings are appended to it.
-#: [format; bytes; -]
-LONGEST_PATH = 200
 #: Remedy if a file cannot be written.
 REMEDY = "check the folder, its rights and its free space"
 
@@ -67,16 +64,11 @@ class Trouble:
 
 
 def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
-    """A path, the same on all ranks; InputTypeError or InputError if it is no path or too long (collective)."""
+    """A path, the same on all ranks; InputTypeError or InputError if it is no path (collective)."""
     with agreed(comm):
         given.kind(what, value, isinstance(value, (str, os.PathLike)), "the path of a file", "None is none")
         if not Path(value).name:
             raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
-        if (n := len(os.fsencode(value))) > LONGEST_PATH:
-            raise InputError(
-                f"{what} has {n} bytes, and MPI-IO takes at most {LONGEST_PATH}: give a shorter one, relative to the "
-                f"working folder, not {value}"
-            )
     given.alike(comm, "files", **{what: str(value)})
     return Path(value)
 
@@ -122,24 +114,6 @@ def on_rank_0(comm: MPI.Comm, what: str, action: Callable[[], T]) -> T:
 def as_bytes(array: AnyArray) -> AnyArray:
     """The bytes of a contiguous array, in place."""
     return array.reshape(-1).view(np.uint8)
-
-
-def write_at(file: MPI.File, offset: int, array: AnyArray) -> None:
-    """Write an array at an offset in bytes."""
-    data = as_bytes(np.ascontiguousarray(array))
-    for i in range(0, len(data), PIECE):
-        piece, status = data[i : i + PIECE], MPI.Status()
-        file.Write_at(offset + i, [piece, MPI.BYTE], status)
-        if status.Get_count(MPI.BYTE) != len(piece):
-            reason = f"{os.strerror(errno.ENOSPC)}, {status.Get_count(MPI.BYTE)} of {len(piece)} bytes written"
-            raise OSError(errno.ENOSPC, reason)
-
-
-def read_at(file: MPI.File, offset: int, array: AnyArray) -> None:
-    """Read a contiguous array from an offset in bytes."""
-    data = as_bytes(array)
-    for i in range(0, len(data), PIECE):
-        file.Read_at(offset + i, [data[i : i + PIECE], MPI.BYTE])
 
 
 def flush(path: Path) -> None:
@@ -236,6 +210,17 @@ class OwnFile:
     def truncate(self, size: int) -> None:
         """Cut the file to a size in bytes."""
         os.truncate(self._descriptor, size)
+
+
+def open_together(path: Path, trouble: Trouble, new: bool = False) -> OwnFile:
+    """A file that all ranks write, not locked; rank 0 makes a ``new`` one (collective)."""
+    file: Any = None
+    for first in (True, False):
+        with trouble:
+            if (trouble.comm.rank == 0) == first:
+                file = OwnFile(path, new=new and first, locked=False)
+        trouble.agree()
+    return file
 
 
 def _lock(descriptor: int) -> bool:

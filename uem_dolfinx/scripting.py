@@ -30,12 +30,12 @@ def dirichlet(V: fem.FunctionSpace, tag: Part, component: int | None = None, val
         V: a Lagrange space with ``size`` components, a part of a mixed space, e.g. ``W.sub(0)``, or a component of either.
         tag: facets, or entities of any dimension: a tag, a list of tags, ``(meshtags, value)``, or facet indices.
         component: 0 is x; None prescribes all components.
-        value: a number, or for all components a vector ``(size,)``; or a Constant of one of these shapes, or a Function of ``V``
-            (for one component of a scalar space, for a vector part of a mixed space of a vector space, of the same degree), both of which
-            may be changed between steps. Or a function of positions x ``(3, n)``, as in DOLFINx's ``interpolate``,
-            which returns ``(n,)``, or for all components ``(size, n)``; with a second argument it is a function of the load factor
-            or time, which needs no ``load`` and is not ramped. Or a UFL expression, such as the component ``w[1]`` of a Function, which
-            is evaluated in every step.
+        value: a number, or for all components a vector ``(size,)``; or a Constant of one of these shapes, or a Function, both of which
+            may be changed between steps. The Function is of ``V``; for one component of a scalar space, for a vector part of a mixed
+            space of a vector space, of the same degree. Or a function of positions x ``(3, n)``, as in DOLFINx's ``interpolate``,
+            which returns ``(n,)``, or for all components ``(size, n)``. With a second argument it depends on the load factor or time;
+            it needs no ``load``, and is not ramped. Or a UFL expression, such as the component ``w[1]`` of a Function, which is
+            evaluated in every step.
 
     Returns:
         DOLFINx's Dirichlet condition.

@@ -17,8 +17,7 @@ from results_scenes import pressed, rows, series, small_disk, strains
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.errors import InputError
-from uem_dolfinx.files import LONGEST_PATH, OwnFile, given_path
+from uem_dolfinx.files import OwnFile
 from uem_dolfinx.parallel import agreed
 
 COMM = MPI.COMM_WORLD
@@ -179,11 +178,3 @@ def test_name_with_marks(folder: Path):
     COMM.barrier()
     ((time, fields),) = series(folder / 'a & "b" <c>.xdmf')
     assert time == 1.0 and "x<y&z" in fields
-
-
-def test_longest_path():
-    """A path that MPI-IO has no room for is refused before any file is made; letters count as bytes."""
-    assert given_path("path", "a" * LONGEST_PATH, COMM) == Path("a" * LONGEST_PATH)
-    for path in ("a" * (LONGEST_PATH + 1), "b/" * LONGEST_PATH + "c", "\u00e4" * (LONGEST_PATH // 2 + 1)):
-        with pytest.raises(InputError, match="give a shorter one"):
-            given_path("path", path, COMM)

@@ -13,6 +13,7 @@ from restart_scenes import COMM, slider, small
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
+from uem_dolfinx.files import OwnFile
 
 
 def untouched(state):
@@ -160,16 +161,14 @@ def test_folder_that_cannot_be_made(folder):
 
 def test_writing_that_fails_leaves_the_last_file(folder, monkeypatch):
     """On one rank the disk is full: all ranks raise, the file before is whole, and nothing else is left."""
-    from uem_dolfinx.restart import checkpoint
-
     uem.write_checkpoint(folder / "run", small(seed=1))
     before = (folder / "run").read_bytes()
 
-    def full(file, offset, array):
+    def full(self, offset, array):
         raise OSError("no space left on device")
 
     if COMM.rank == COMM.size - 1:
-        monkeypatch.setattr(checkpoint, "write_at", full)
+        monkeypatch.setattr(OwnFile, "write_at", full)
     raised(
         uem.CheckpointError, "cannot be written .no space left on device.", lambda: uem.write_checkpoint(folder / "run", small())
     )

@@ -83,8 +83,8 @@ def not_attached(name: str) -> SurfaceError:
     return SurfaceError(f"contact '{name}' belongs to no problem yet: hand it to a UnitedProblem first")
 
 
-class OfProblem:
-    """Base of objects whose results exist only in a problem."""
+class ManyContacts:
+    """Base of declarations of several contacts at once, as ``GeneralContact``; results exist only in a problem."""
 
     name: str
     _attached: Configuration | None = None

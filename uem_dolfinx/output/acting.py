@@ -20,7 +20,7 @@ from uem_dolfinx.geometry.bodies import body_sums, find_bodies
 from uem_dolfinx.geometry.rigid import RigidSurface
 from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.output.drawings import EVEN
-from uem_dolfinx.output.frames import boundary_and_cells, vertex_positions
+from uem_dolfinx.output.frames import at_vertices, boundary_and_cells, vertex_positions
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.loading import rules_of, set_loads
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -127,11 +127,8 @@ class Outside:
         """Values at vertices ``(n_local of P1, k)``, from values at nodes ``(n_local, k)`` (collective)."""
         config, shape = self.config, (values.shape[1],) if values.shape[1] > 1 else ()
         field = fem.Function(compat.function_space(self.mesh, config.degree, shape))
-        linear = fem.Function(compat.function_space(self.mesh, 1, shape))
         field.x.array[:] = values.ravel()
-        linear.interpolate(field)
-        linear.x.scatter_forward()
-        return np.array(linear.x.array.reshape(-1, values.shape[1]))
+        return at_vertices(field).reshape(-1, values.shape[1])
 
     def touched(self, which: Bools) -> Bools:
         """Mask of vertices ``(n_local,)`` of owned facets in a mask, including facets of other ranks (collective)."""
@@ -224,10 +221,7 @@ class Actions:
             self.config.fill(copies, mask)
             for name, field in copies.items():
                 if name != self.config.name and field.ufl_shape == () and compat.lagrange_degree(field.function_space):
-                    linear = fem.Function(compat.function_space(self.config.mesh, 1))
-                    linear.interpolate(field)
-                    linear.x.scatter_forward()
-                    values = np.array(linear.x.array)[:, None]
+                    values = at_vertices(field)[:, None]
                     self._note("value", f"prescribed value of {name.replace('_', ' ')}", values > 0.5, values)
 
     def _note(self, kind: str, name: str, where: Bools, vectors: Array) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general.general import GeneralContact
+from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.geometry.tags import Part
@@ -47,7 +47,7 @@ class Drawing:
         given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
         # the pressure of a contact is drawn as the contact itself: up to date, and grey where it is open
         field = next((one for one in problem.declared if field is not None and field is one._fields.get("pressure")), field)
-        gdim, pressed = problem.config.gdim, isinstance(field, Contact | GeneralContact)
+        gdim, pressed = problem.config.gdim, isinstance(field, Contact | ManyContacts)
         with agreed(problem.comm):
             for what, flag in (("mirror", mirror), ("cells", cells), ("arrows", arrows), ("rigid", rigid), ("triad", triad)):
                 if flag is not None:
@@ -59,7 +59,7 @@ class Drawing:
             elif len(levels) < 2 or not (np.diff(given.vector("levels", levels, len(levels))) > 0).all():  # type: ignore[arg-type]
                 raise InputError(given.sentence("levels", levels, "the number of colours, or two or more bounds that grow"))
             if isinstance(field, (list, tuple)) and len(field):
-                pressed = bool(given.items("field", field, lambda one: isinstance(one, Contact | GeneralContact), "a contact"))
+                pressed = bool(given.items("field", field, lambda one: isinstance(one, Contact | ManyContacts), "a contact"))
             elif not (field is None or pressed or getattr(field, "ufl_shape", None) == ()):
                 raise InputError(given.sentence("field", field, FIELD))
             scale = given.number("scale", scale)
@@ -86,15 +86,16 @@ class Drawing:
         self.label = label or (size if field is None else "contact pressure" if pressed else "")
         self.levels, self.window, self.mirror, self.cells, self.cmap = levels, window, mirror, cells, cmap
         self.percentiles, self.triad, self.pressed = percentiles, triad, pressed
-        self.width = 1600  # width of an image of a 3D scene in points
         self.comm = problem.comm
         gathering = Gathering(problem, field, scale, gdim == 2 if arrows is None else bool(arrows), surface, box, rigid)
         self.take, self.pieces = gathering.take, gathering.pieces
 
-    def over(self, frames: Sequence[Frame]) -> Drawn:
-        """Object that draws these frames, on rank 0, with the same window, colours and scale of arrows for all of them."""
+    def over(self, frames: Sequence[Frame], width: int) -> Drawn:
+        """Draws these frames, on rank 0, with one window, colours and scale of arrows; images of 3D scenes have a ``width`` in points."""
         assert self.pieces is not None
-        return (Drawn3D if frames[0].x.shape[1] == 3 else Drawn2D)(self, self.pieces, frames)
+        if frames[0].x.shape[1] == 3:
+            return Drawn3D(self, self.pieces, frames, width)
+        return Drawn2D(self, self.pieces, frames)
 
 
 def checked_view(gdim: int, view: str | Sequence[float] | None) -> Array:
@@ -309,7 +310,7 @@ def draw_rigid(ax: Any, shape: Shape, box: Array, mirror: bool = False, **line: 
 class Drawn3D(Drawn):
     """An image of the bodies' surface by PyVista, with matplotlib's colour bar."""
 
-    def __init__(self, how: Drawing, pieces: Pieces, frames: Sequence[Frame]):
+    def __init__(self, how: Drawing, pieces: Pieces, frames: Sequence[Frame], width: int):
         super().__init__(how, pieces, frames)
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -318,7 +319,7 @@ class Drawn3D(Drawn):
         colours = ListedColormap(self.cmap(np.linspace(0.0, 1.0, n))).with_extremes(under=self.cmap.get_under())
         self.colours = ScalarMappable(BoundaryNorm(self.bounds, n), colours)
         look = pictures3d.Look(
-            colours, NO_PRESSURE if how.pressed else None, self.box, how.window is not None, how.view, how.cells, how.width, EVEN
+            colours, NO_PRESSURE if how.pressed else None, self.box, how.window is not None, how.view, how.cells, width, EVEN
         )
         solids = [
             pictures3d.Solid(f.x, self._between(f.values), (f.cuts[0], self._between(f.cuts[1])), self._arrows(f), f.rigid)

@@ -139,8 +139,7 @@ def _write(path: Path, drawing: Drawing, frames: list[Frame | None], rate: float
 
     canvas = new_canvas(f"the film {path}", size)
     # smaller than a picture
-    drawing.width = round(1.25 * 100 * size[0])
-    drawn = drawing.over(taken)
+    drawn = drawing.over(taken, round(1.25 * 100 * size[0]))
     writer = (PillowWriter if path.suffix == ".gif" else FFMpegWriter)(fps=rate)
     with writer.saving(canvas, str(path), 100):
         for frame, title in zip(taken, titles([frame.state for frame in taken])):

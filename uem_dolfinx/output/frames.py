@@ -14,7 +14,7 @@ from dolfinx.mesh import exterior_facet_indices
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general.general import GeneralContact
+from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.mesh_sizes import FILLED_BY
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
@@ -183,14 +183,20 @@ def vertex_values(problem: UnitedProblem, field: Any) -> Array:
         return np.asarray(np.linalg.norm(moved, axis=1))
     if isinstance(field, Sequence):
         return np.asarray(sum(vertex_values(problem, contact) for contact in field))
-    if isinstance(field, Contact | GeneralContact):
-        field = field.pressure
+    if isinstance(field, Contact | ManyContacts):
+        contact: Any = field
+        field = contact.pressure
     if isinstance(field, fem.Function) and compat.lagrange_degree(field.function_space):
-        linear = fem.Function(compat.function_space(mesh, 1))
-        linear.interpolate(field)
-        linear.x.scatter_forward()
-        return np.array(linear.x.array)
+        return at_vertices(field)
     return nodal_average(field, mesh)
+
+
+def at_vertices(field: fem.Function) -> Array:
+    """A Lagrange Function at the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts, ...)`` (collective)."""
+    linear = fem.Function(compat.function_space(field.function_space.mesh, 1, field.ufl_shape))
+    linear.interpolate(field)
+    linear.x.scatter_forward()
+    return np.array(linear.x.array).reshape(-1, *field.ufl_shape)
 
 
 def nodal_average(expression: Any, mesh: Any) -> Array:
@@ -211,12 +217,8 @@ def nodal_average(expression: Any, mesh: Any) -> Array:
 def vertex_positions(problem: UnitedProblem, scale: float) -> Array:
     """Displaced positions of the d.o.f. of the mesh's P1 space ``(n_local incl. ghosts, gdim)``."""
     config = problem.config
-    u = fem.Function(compat.function_space(config.mesh, 1, (config.gdim,)))
-    if config.moves:
-        u.interpolate(config.functions()["displacement"])
-        u.x.scatter_forward()
-    moved = u.x.array.reshape(-1, config.gdim)
-    return np.array(u.function_space.tabulate_dof_coordinates()[: len(moved), : config.gdim] + scale * moved)
+    X = np.array(compat.function_space(config.mesh, 1).tabulate_dof_coordinates()[:, : config.gdim])
+    return X + scale * at_vertices(config.functions()["displacement"]) if config.moves else X
 
 
 def vertex_cells(mesh: Any) -> tuple[Ints, Ints]:

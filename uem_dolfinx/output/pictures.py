@@ -15,7 +15,7 @@ import numpy as np
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general.general import GeneralContact
+from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import InputError, InputTypeError, MissingBackendError, OutputError
 from uem_dolfinx.files import REMEDY
 from uem_dolfinx.geometry.tags import Part
@@ -148,6 +148,11 @@ def panel_of(
             yield picture
 
 
+def _image_width(panel: Any) -> int:
+    """Width in points of an image of a 3D scene in a panel."""
+    return max(1600, round(2.0 * panel.get_window_extent().width))
+
+
 def plot_scene(
     problem: UnitedProblem,
     picture: str | Path | Any = ...,
@@ -213,8 +218,7 @@ def plot_scene(
     with panel_of(file if picture is ... else picture, problem.comm, size, dpi) as panel:
         if panel is not None and frame is not None:
             # margins are cut off
-            drawing.width = max(drawing.width, round(2.0 * panel.get_window_extent().width))
-            drawing.over([frame]).draw(panel, frame)
+            drawing.over([frame], _image_width(panel)).draw(panel, frame)
     return Picture(file.getvalue()) if picture is ... else None
 
 
@@ -289,8 +293,8 @@ def plot_setup(
     found, file = Declarations(problem, at, loads).found, BytesIO()
     with panel_of(file if picture is ... else picture, problem.comm, size, dpi) as panel:
         if panel is not None and found is not None:
-            width = max(1600, round(2.0 * panel.get_window_extent().width))
-            (draw_2d if gdim == 2 else draw_3d)(panel, found, Look(more, cells, box, toward, legend, triad, width))
+            look = Look(more, cells, box, toward, legend, triad, _image_width(panel))
+            (draw_2d if gdim == 2 else draw_3d)(panel, found, look)
     return Picture(file.getvalue()) if picture is ... else None
 
 
@@ -363,7 +367,7 @@ def plot_pressure(
 
 
 def _is_contact(one: Any) -> bool:
-    return isinstance(one, (Contact, GeneralContact))
+    return isinstance(one, (Contact, ManyContacts))
 
 
 def _curve(what: str, f: Callable[[Array], Any], at: Array, n: int) -> Array:

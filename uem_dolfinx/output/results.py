@@ -13,7 +13,6 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.files import aside, given_path, given_resume, in_use, keep_aside, on_rank_0
 from uem_dolfinx.form_checks import check_values
@@ -360,9 +359,9 @@ def clock(step: LoadStep | TimeStep | float) -> float:
     return float(step.time if isinstance(step, TimeStep | LoadStep) else step)
 
 
-def contact_fields(contact: Contact | GeneralContact) -> dict[str, fem.Function]:
+def contact_fields(contact: Any) -> dict[str, fem.Function]:
     """Fields on the contactors of a contact by name, of friction, ties, bonds, wear and heat only where there are any (collective)."""
-    parts = contact.parts if isinstance(contact, GeneralContact) else [contact]
+    parts = [contact] if isinstance(contact, Contact) else contact.parts
     found = {name: getattr(contact, name) for name in ("pressure", "gap", "active", "force")}
     rubs = any(part.pair.friction is not None for part in parts)
     if rubs or any(part.pair.tie is not None for part in parts):
@@ -380,7 +379,7 @@ def contact_fields(contact: Contact | GeneralContact) -> dict[str, fem.Function]
     return found
 
 
-def contact_suffixes(contacts: Sequence[Contact | GeneralContact]) -> list[str]:
+def contact_suffixes(contacts: Sequence[Any]) -> list[str]:
     """Suffixes of the contacts in names of fields and columns; empty for a single contact."""
     if len(contacts) == 1:
         return [""]

@@ -17,7 +17,7 @@ import numpy as np
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.general.general import GeneralContact
+from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import CheckpointError, InputError, OutputError, UEMError
 from uem_dolfinx.files import OwnFile, begin_file, given_path, in_use, keep_aside, new_folder, on_rank_0
 from uem_dolfinx.log import logger, timed
@@ -229,12 +229,12 @@ class PairTables(Closing):
     """
 
     def __init__(self, path: Path, problem: UnitedProblem, suffixes: list[str], clock: str, resultant: list[str], resume: bool):
-        self._general = [contact for contact in problem.declared if isinstance(contact, GeneralContact)]
+        self._general = [contact for contact in problem.declared if isinstance(contact, ManyContacts)]
         names = ["first", "second"]
         columns, resume_at = [clock, "step", *names, "active", *resultant], problem.progress if resume else None
         self._tables: list[CsvTable] = []
         for contact, suffix in zip(problem.declared, suffixes):
-            if isinstance(contact, GeneralContact):
+            if isinstance(contact, ManyContacts):
                 name = path.with_name(f"{path.stem}_pairs{suffix}{path.suffix}")
                 try:
                     self._tables.append(CsvTable(name, problem.comm, columns, resume_at, key="step", words=names))

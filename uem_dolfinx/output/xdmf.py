@@ -20,7 +20,7 @@ from dolfinx import fem
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.errors import CheckpointError, OutputError, UEMError
-from uem_dolfinx.files import REMEDY, OwnFile, Trouble, begin_file, on_rank_0
+from uem_dolfinx.files import REMEDY, OwnFile, Trouble, begin_file, on_rank_0, open_together
 from uem_dolfinx.restart.numbering import Numbering, n_cells, node_numbering
 
 #: XDMF's names of cells, by name and number of nodes.
@@ -178,12 +178,7 @@ class XdmfSeries:
     def _open(self, kind: type[UEMError] = OutputError, *, begin: bool = False) -> None:
         """Open the file of numbers on every rank, a new file under a temporary name (collective)."""
         path = self._numbers.with_name(f".{self._numbers.name}.{self.comm.bcast(os.getpid())}") if begin else self._numbers
-        trouble = Trouble(self.comm, self._trouble, REMEDY, kind)
-        for first in (True, False):
-            with trouble:
-                if (self.comm.rank == 0) == first:
-                    self._bin = OwnFile(path, new=begin and first, locked=False)
-            trouble.agree()
+        self._bin = open_together(path, Trouble(self.comm, self._trouble, REMEDY, kind), begin)
 
     def _begin(self) -> None:
         """Begin new files with the mesh (collective)."""

@@ -1,7 +1,6 @@
 """Checkpoints, from which long runs are restarted: one file, written and read by any number of ranks.
 
-The file follows the input order of the mesh. Every rank writes and reads its own part through MPI-IO, in the binary format of numbers
-in memory.
+The file follows the input order of the mesh. Every rank writes and reads its own part, in the binary format of numbers in memory.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.arrays import AnyArray
 from uem_dolfinx.errors import CheckpointError, UEMError
-from uem_dolfinx.files import REMEDY, Trouble, flush, given_path, read_at, write_at
+from uem_dolfinx.files import REMEDY, Trouble, flush, given_path, open_together
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed, all_come, ask_together, is_agreed, prepare_meeting
 from uem_dolfinx.restart.interruption import Interruption, end_run
@@ -64,17 +63,14 @@ def write_checkpoint(path: str | Path, state: State) -> None:
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 beside.unlink(missing_ok=True)
-        trouble.agree()
-        with trouble:
-            file = MPI.File.Open(comm, str(beside), MPI.MODE_CREATE | MPI.MODE_WRONLY)
-        trouble.agree()
+        file = open_together(beside, trouble, new=True)
         end, tables = HEAD, []
         for entry in state.entries:
             part = entry.numbering.to_table(entry.to_checkpoint())
             width = part.dtype.itemsize * int(np.prod(part.shape[1:]))
             tables.append(hashes(part))
             with trouble:
-                write_at(file, end + width * entry.numbering.first, part)
+                file.write_at(end + width * entry.numbering.first, part)
             end += width * entry.numbering.total
         content = {
             "state": described, "data": fingerprint(comm, tables), "motions": state.motions(), "numbers": state.numbers,
@@ -84,14 +80,13 @@ def write_checkpoint(path: str | Path, state: State) -> None:
             if comm.rank == 0:
                 text = _text(content)
                 for offset, data in ((end, text), (0, _head(end, text))):
-                    write_at(file, offset, np.frombuffer(data, dtype=np.uint8))
-        for end_of_writing in (file.Sync, file.Close):
-            with trouble:
-                end_of_writing()
+                    file.write_at(offset, np.frombuffer(data, dtype=np.uint8))
+        file.close()
+        with trouble:
+            flush(beside)
         complete = all(comm.allgather(trouble.none))
         with trouble:
             if comm.rank == 0 and complete:
-                flush(beside)
                 os.replace(beside, path)
                 flush(path.parent)
             elif comm.rank == 0:
@@ -123,19 +118,14 @@ def read_checkpoint(path: str | Path, state: State) -> None:
         content = comm.bcast(content)
         _compare(path, content["state"], state.describe())
         _compare_settings(path, content["settings"], state)
-        with trouble:
-            file = MPI.File.Open(comm, str(path), MPI.MODE_RDONLY)
-        trouble.agree()
         # the first pass computes the hash only, so that a damaged file changes nothing
-        found = fingerprint(comm, [hashes(part) for part in _parts(file, state, trouble)])
+        found = fingerprint(comm, [hashes(part) for part in _parts(path, state, trouble)])
         with trouble:
             if trouble.none and found != content["data"]:
                 raise _damaged(path, f"data with the hash {content['data']}", f"the hash {found}")
         if not any(comm.allgather(not trouble.none)):
-            for entry, part in zip(state.entries, _parts(file, state, trouble)):
+            for entry, part in zip(state.entries, _parts(path, state, trouble)):
                 entry.from_checkpoint(entry.numbering.from_table(part))
-        with trouble:
-            file.Close()
         trouble.agree()
     state.numbers.clear()
     state.numbers.update(content["numbers"])
@@ -165,7 +155,7 @@ def _trouble(comm: MPI.Comm, what: str, remedy: str) -> Trouble:
     return Trouble(comm, what, remedy, CheckpointError)
 
 
-def _parts(file: MPI.File, state: State, trouble: Trouble) -> Iterator[AnyArray]:
+def _parts(path: Path, state: State, trouble: Trouble) -> Iterator[AnyArray]:
     """This rank's parts of the tables, one after the other (collective)."""
     end = HEAD
     for entry in state.entries:
@@ -173,7 +163,8 @@ def _parts(file: MPI.File, state: State, trouble: Trouble) -> Iterator[AnyArray]
         part = np.zeros((entry.numbering.count, *rows.shape[1:]), dtype=rows.dtype)
         width = part.dtype.itemsize * int(np.prod(part.shape[1:]))
         with trouble:
-            read_at(file, end + width * entry.numbering.first, part)
+            found = np.fromfile(path, part.dtype, part.size, offset=end + width * entry.numbering.first)
+            part.reshape(-1)[: len(found)] = found
         end += width * entry.numbering.total
         yield part
 

@@ -12,9 +12,9 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.compiled import with_options
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general.general import GeneralContact, parts_of
 from uem_dolfinx.contact.joining import attached
 from uem_dolfinx.contact.pair.interface import Interface, motions_of
+from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.contact.warnings.checks import check_moved, check_new
 from uem_dolfinx.contact.warnings.watch import Watch
 from uem_dolfinx.errors import InputError, UEMError
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.conditions.joints import Link
     from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
     from uem_dolfinx.conditions.user_rows import UserRows
+    from uem_dolfinx.contact.general.general import GeneralContact
     from uem_dolfinx.dynamics.inertia import Dynamics
     from uem_dolfinx.materials.elastic import HistoryMaterial
     from uem_dolfinx.restart.state import State
@@ -132,7 +133,7 @@ class UnitedProblem(given.Sealed):
             checks.check_residual(F, u)
             self.load = check_load(load)
             bcs = checks.check_conditions(self.config, bcs)
-            kinds, what = Contact | GeneralContact, "an Equation, or what periodic returns"
+            kinds, what = Contact | ManyContacts, "an Equation, or what periodic returns"
             contacts = given.items("contacts", contacts, lambda one: isinstance(one, kinds), "a Contact or a GeneralContact")
             check_new(contacts)
             equations = given.items("equations", equations, lambda one: hasattr(one, "n_values"), what)
@@ -199,7 +200,9 @@ class UnitedProblem(given.Sealed):
         rigid = checks.rigid_nodes(self.config, free, couplings if contacts else [])
         clock: dict[str, Any] = {} if dynamics is None else {"at": dynamics.time, "duration": lambda: dynamics.dt}
         self.config.equations = equations
-        parts = parts_of(contacts, self.config, rigid)
+        single = [one for one in contacts if isinstance(one, Contact)]
+        many = [[one] if isinstance(one, Contact) else one.make_parts(self.config, single, rigid) for one in contacts]
+        parts = [part for some in many for part in some]
         self.contacts: list[Contact] = attached(parts, self.config, free, clock, method is BodySystem)
         if dynamics is not None:
             from uem_dolfinx.dynamics.massless import warn_of_soft_targets

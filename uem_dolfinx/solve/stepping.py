@@ -16,7 +16,6 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.contact import Contact
-from uem_dolfinx.contact.general.general import GeneralContact
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.restart.interruption import InterruptedStepError, Interruption, end_run
@@ -25,6 +24,7 @@ from uem_dolfinx.solve.step_control import StepControl
 from uem_dolfinx.solve.united.newton import Iteration
 
 if TYPE_CHECKING:
+    from uem_dolfinx.contact.general.general import GeneralContact
     from uem_dolfinx.restart.checkpoint import Checkpoint
     from uem_dolfinx.restart.state import State
 

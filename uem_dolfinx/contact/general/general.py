@@ -23,7 +23,7 @@ from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, Rigid
 from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
 from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, given_normal
-from uem_dolfinx.contact.results import OfProblem, Resultant, not_attached, sum_up
+from uem_dolfinx.contact.results import ManyContacts, Resultant, not_attached, sum_up
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.geometry.skin import Apart
 
 
-class GeneralContact(OfProblem, given.Sealed):
+class GeneralContact(ManyContacts, given.Sealed):
     """Contact of every surface with every other, and with rigid surfaces, by one declaration.
 
     Facets far from other surfaces cost almost nothing. Bodies are the connected components of the mesh. Between two bodies the
@@ -434,9 +434,3 @@ class GeneralContact(OfProblem, given.Sealed):
     def _rigid_name(self, part: Contact) -> str:
         """Name of a contact's rigid surface in ``touching``."""
         return part.name.removeprefix(f"{self.name} on ")
-
-
-def parts_of(contacts: Sequence[Contact | GeneralContact], config: Configuration, rigid: Bools) -> list[Contact]:
-    """Contacts, with general contacts replaced by their parts, in a problem with these ``rigid (n_owned,)`` nodes (collective)."""
-    single = [one for one in contacts if isinstance(one, Contact)]
-    return [part for one in contacts for part in ([one] if isinstance(one, Contact) else one.make_parts(config, single, rigid))]

@@ -62,21 +62,18 @@ class Bonds(Tie):
 
     def openings(self) -> Array:
         """Openings of the bonds, means with mortar ``(n, gdim)`` (collective)."""
-        assert self.rows is not None
-        w, has = np.zeros(self._left_out.shape), self.rows.has
-        w[has] = self._equations().gap / np.where(self.rows.share > 0.0, self.rows.share, 1.0)[has]
+        w, rows = np.zeros(self._left_out.shape), self.made
+        w[rows.has] = self._equations().gap / np.where(rows.share > 0.0, rows.share, 1.0)[rows.has]
         return w
 
     def bonded_areas(self, areas: Array) -> Array:
         """Areas of the bonds in the reference configuration, from those of the nodes, each ``(n,)``; 0 without a bond."""
-        assert self.rows is not None
-        return np.where(self.bonded, areas if self.rows.area is None else self.rows.area, 0.0)
+        return np.where(self.bonded, areas if self.made.area is None else self.made.area, 0.0)
 
     def stiffness(self, tangent: Array) -> tuple[Ints, Array]:
         """Blocks ``sum_cd tangent_cd r_c r_d'`` with the gradients r of the equations, see ``dyads``; ``tangent (n, gdim, gdim)``."""
-        assert self.rows is not None
         eq, g = self._equations(), self.config.gdim
-        i, c = np.nonzero(self.rows.has)
+        i, c = np.nonzero(self.made.has)
         row = np.append(np.arange(len(eq)), eq.row)
         node = np.append(self.config.to_global(eq.node), eq.followed)
         vector = np.concatenate([eq.direction, -eq.coefficients])

@@ -147,7 +147,7 @@ class Preloaded(Tie):
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
         """See ``Tie``; while the opening is free, all rows except the leading one, on which they depend (collective)."""
-        here, (i, c) = self._equations(), np.nonzero(self._has)
+        here, (i, c) = self._equations(), np.nonzero(self.made.has)
         if self.locked:
             return here, i, c
         own = None
@@ -188,13 +188,13 @@ class Preloaded(Tie):
 
     def _pull(self, bond: Array) -> float:
         """Force in the section from multipliers ``bond (n, gdim)``, positive in tension (collective)."""
-        return -float(reduced(self.config.comm, float(self.along @ bond[self._has])))
+        return -float(reduced(self.config.comm, float(self.along @ bond[self.made.has])))
 
     def _by_lead(self, force: float) -> Array:
         """Multipliers ``(n, gdim)`` of a section ``force`` that the leading row carries alone."""
-        alone = np.zeros(self._has.shape)
+        alone = np.zeros(self.made.has.shape)
         if self._lead >= 0:
-            i, c = np.nonzero(self._has)
+            i, c = np.nonzero(self.made.has)
             alone[i[self._lead], c[self._lead]] = -force / self.along[self._lead]
         return alone
 
@@ -207,18 +207,11 @@ class Preloaded(Tie):
         """See ``Interface``; the pair of forces on the faces, by default the given one, while the opening is free (collective)."""
         if self.locked:
             return None
-        assert self.rows is not None
-        return self.rows.handed_on(self._equations(), self._by_lead(self.force if force is None else force))
+        return self.made.handed_on(self._equations(), self._by_lead(self.force if force is None else force))
 
     def opening_back(self) -> Array:
         """Derivative of the opening by the positions of the owned nodes, while it is free ``(n_owned, gdim)`` (collective)."""
-        assert self.rows is not None
-        return self.config.add_at_owners(*self.rows.handed_on(self._equations(), self._by_lead(-1.0)))
-
-    @property
-    def _has(self) -> Bools:
-        assert self.rows is not None
-        return self.rows.has
+        return self.config.add_at_owners(*self.made.handed_on(self._equations(), self._by_lead(-1.0)))
 
     # -- results, and from step to step ----------------------------------------------------------------------------------
 

@@ -92,15 +92,14 @@ class Tie:
         forces = state.lam[:, None] * projection.normal + drag if self.means else state.force
         self.at.x.array[:] = self.config.displacement.ravel()
         self._make(self._within_reach(state) if which is None else which, off)
-        assert self.rows is not None
-        error = None
-        if not reduced(self.config.comm, int(self.rows.has.sum())):
+        rows, error = self.made, None
+        if not reduced(self.config.comm, int(rows.has.sum())):
             what = "is near enough to the target" if which is None else "touches the target"
             error = SurfaceError(
                 f"{self.name}: no contactor {what} to be tied to it: bring the surfaces together, or give a larger adjust"
             )
         agree(self.config.comm, error)
-        bond = np.where(self.rows.has, forces / np.where(self.rows.share > 0, self.rows.share, 1.0), 0.0)
+        bond = np.where(rows.has, forces / np.where(rows.share > 0, rows.share, 1.0), 0.0)
         return self.untouched(replace(state, bond=bond))
 
     @property
@@ -176,11 +175,16 @@ class Tie:
         """Contactors that take no part in contact ``(n,)``."""
         return self.tied
 
+    @property
+    def made(self) -> TiedRows:
+        """The rows, once contactors are tied."""
+        assert self.rows is not None
+        return self.rows
+
     def _equations(self) -> UnitingEquations:
         """Equations of tied contactors in the current configuration (collective)."""
-        assert self.rows is not None
         if self._here is None:
-            self._here = self.rows.equations(self.target.motion)
+            self._here = self.made.equations(self.target.motion)
         return self._here
 
     def largest_gap_here(self) -> float:
@@ -214,8 +218,7 @@ class Tie:
 
     def _uniting(self) -> tuple[UnitingEquations, Ints, Ints]:
         """Equations of tied contactors, with their contactors and components ``(m,)`` (collective)."""
-        assert self.rows is not None
-        i, c = np.nonzero(self.rows.has)
+        i, c = np.nonzero(self.made.has)
         return self._equations(), i, c
 
     def set_redundant(self, equations: ContactRows, redundant: Bools) -> None:
@@ -242,8 +245,7 @@ class Tie:
 
     def _on_contactors(self, bond: Array) -> Array:
         """Forces on the contactors of multipliers ``bond (n, gdim)``: ``(n, gdim)`` (collective)."""
-        assert self.rows is not None
-        return np.asarray(self.config.add_at_owners(*self.rows.handed_on(self._equations(), bond))[self.nodes])
+        return np.asarray(self.config.add_at_owners(*self.made.handed_on(self._equations(), bond))[self.nodes])
 
     def nodal_forces(self, state: PairState, contact: Callable[[PairState], tuple[Ints, Array]]) -> tuple[Ints, Array]:
         """Forces at nodes of both bodies as in ``Kinematics``; ``contact`` returns the contact part (collective)."""
@@ -304,6 +306,5 @@ class Tie:
         tied = np.array(kept["tied"])
         if reduced(self.config.comm, int(tied.sum())):
             self._make(tied, off)
-            assert self.rows is not None
-            if self.rows.held is not None:
-                self._take_rows(replace(self.rows, held=np.array(kept["held_at"])), off)
+            if self.made.held is not None:
+                self._take_rows(replace(self.made, held=np.array(kept["held_at"])), off)

@@ -14,11 +14,11 @@ from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.stepping import LoadStep, begin_checkpoint, between_steps
 from uem_dolfinx.solve.steps.by_load import ByLoad
-from uem_dolfinx.solve.steps.dissipation import Dissipation
 
 if TYPE_CHECKING:
     from uem_dolfinx.restart.checkpoint import Checkpoint
     from uem_dolfinx.solve.steps.arc_length import AlongArc
+    from uem_dolfinx.solve.steps.dissipation import Dissipation
     from uem_dolfinx.solve.steps.stages import Step
 
 
@@ -63,9 +63,12 @@ def load_steps(
     check_steps(problem, checkpoint)
     several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
     with agreed(problem.comm):
-        by = arc_length if isinstance(arc_length, Dissipation) else None
-        given.kind("arc_length", arc_length, by is not None or isinstance(arc_length, bool), "True, False or a Dissipation")
-        arc_length = bool(arc_length)
+        by = None
+        if not isinstance(arc_length, bool):
+            from uem_dolfinx.solve.steps.dissipation import Dissipation
+
+            expected = "True, False or a Dissipation"
+            by, arc_length = given.kind("arc_length", arc_length, isinstance(arc_length, Dissipation), expected), True
         if several and arc_length:
             raise InputError(
                 "arc_length = True does not go with a list of Step: follow a path by load_steps(problem, n, arc_length=True)"
