@@ -301,9 +301,9 @@ def test_faces_that_look_at_each_other(slope, n, coupling):
 
 def test_small_ways_are_not_looked_at(monkeypatch):
     """Where nothing moves by half a facet no way is searched for crossings."""
-    from uem_dolfinx.solve import passages
+    from uem_dolfinx.geometry import crossings
 
-    monkeypatch.setattr(passages, "cross_target", None)
+    monkeypatch.setattr(crossings, "cross_target", None)
     problem, contact = plate_and_block(gap=0.0, push=(0.0, -0.08))
     run(problem, 4)
     assert contact.n_active > 0

@@ -39,7 +39,6 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of
 from uem_dolfinx.geometry.projection import Target
 from uem_dolfinx.geometry.search import MeshTarget
-from uem_dolfinx.geometry.shared_target import shared_target
 from uem_dolfinx.geometry.surfaces import check_distinct, surface_nodes
 from uem_dolfinx.geometry.tags import Part, Tag, as_tag, communicator_of, name_of
 from uem_dolfinx.parallel import agreed, reduced
@@ -388,11 +387,13 @@ class Contact(WatchedContact, given.Sealed):
             means = Mortar(config, nodes, target, surface=surface, **(how | {"sliding": "finite"})) if tied else None
             law = self.normal is not None or (self.cohesion is not None and not self.cohesion.bonds)
             return Mortar(config, nodes, target, surface=surface, of_gaps=law, **how), means
-        from uem_dolfinx.contact.nodes.bernstein import Bernstein
         from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 
-        kind = Bernstein if config.degree == 2 else NodeToSurface
-        own = self.coupling if callable(self.coupling) else kind
+        own: Any = self.coupling if callable(self.coupling) else NodeToSurface
+        if config.degree == 2 and not callable(self.coupling):
+            from uem_dolfinx.contact.nodes.bernstein import Bernstein
+
+            own = Bernstein
         return own(config, nodes, target, chords=self.chords and config.degree == 2, contactor=self.contactor, **how), None
 
     @property
@@ -438,6 +439,8 @@ class Contact(WatchedContact, given.Sealed):
         """Owned contactor nodes and their target (collective)."""
         nodes = surface_nodes(config, self.contactor)
         if hasattr(self.target, "project"):
+            from uem_dolfinx.geometry.shared_target import shared_target
+
             return nodes, shared_target(self.target, config.comm, config.gdim)
         self.target = as_tag(self.target, config.mesh, (config.tdim - 1,), "target")
         surface = facets_of(config, self.target)

@@ -24,8 +24,8 @@ from uem_dolfinx.geometry.tags import Part
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.conditions.seams import Seam
     from uem_dolfinx.contact.laws.conductance import Conductance
-    from uem_dolfinx.contact.mortar.rows import Seam
 
 
 #: Smaller areas, over those of nodes around, are zero to rounding.
@@ -177,8 +177,7 @@ class ContactResults(HeatResults):
     @cached_property
     def _seam(self) -> Seam:
         """Contactors that equations of users give one displacement (first time: collective)."""
-        from uem_dolfinx.conditions.seams import seams_of
-        from uem_dolfinx.contact.mortar.rows import Seam
+        from uem_dolfinx.conditions.seams import Seam, seams_of
 
         return Seam(self.config, self.nodes, seams_of(self.config))
 

@@ -9,6 +9,11 @@ from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.errors import MeshError
 from uem_dolfinx.geometry.nodes import described
 
+#: Simplices that fill a cell, by its vertices in DOLFINx's order.
+FILLED_BY = {
+    "triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]], "tetrahedron": [[0, 1, 2, 3]],
+    "hexahedron": [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]],
+}  # fmt: skip
 #: A cell whose thickness is less than this is flat. [convention; size of the cell; test_cells.py::test_how_thin_a_cell_may_be]
 FLAT_CELL = 1e-10
 #: Cells whose volumes are computed at a time, which bounds the memory and changes no result. [bound; number; -]

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -19,10 +19,12 @@ from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.errors import MeshError, MissingBackendError, MissingFileError
 from uem_dolfinx.geometry.cells import check_edges, check_nodes, check_volumes
 from uem_dolfinx.geometry.cuts import Group, RawMesh, cut_along
-from uem_dolfinx.geometry.mesh_sizes import MeshSizes
 from uem_dolfinx.geometry.tags import Tag, Tags
 from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.mesh_sizes import MeshSizes
 
 CELLS = {
     2: ("triangle", 1), 3: ("quadrilateral", 1), 4: ("tetrahedron", 1), 5: ("hexahedron", 1),
@@ -96,7 +98,7 @@ def read_gmsh(
         given.kind("parameters", parameters, known, "numbers by name, as {'h': 0.1}, or None")
         for name, value in (parameters or {}).items():
             given.number(f"parameters[{name!r}]", value, given.Range("a finite number", lambda x: True))
-        given.kind("size", size, size is None or isinstance(size, MeshSizes), "what adapt passes to make, or None")
+        given.kind("size", size, size is None or hasattr(size, "within"), "what adapt passes to make, or None")
         return cut_along(_read(source, gdim, dict(parameters or {}), size), cut)
 
     return distributed(comm, read, source if isinstance(source, (str, Path)) else "gmsh model")

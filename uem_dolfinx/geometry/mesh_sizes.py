@@ -10,12 +10,8 @@ import numpy as np
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import Array, Bools, Ints
+from uem_dolfinx.geometry.cells import FILLED_BY
 
-#: Simplices that fill a cell, by its vertices in DOLFINx's order.
-FILLED_BY = {
-    "triangle": [[0, 1, 2]], "quadrilateral": [[0, 1, 3], [0, 3, 2]], "tetrahedron": [[0, 1, 2, 3]],
-    "hexahedron": [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]],
-}  # fmt: skip
 #: Sizes grow by at most this part of the way from one cell to the next, so that cells have good shapes.
 #: [convention; size over distance; test_mesh_sizes.py::test_sizes_grow_slowly]
 GROWTH = 0.5

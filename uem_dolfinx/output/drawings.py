@@ -18,7 +18,6 @@ from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.form_checks import check_values
 from uem_dolfinx.geometry.tags import Part
-from uem_dolfinx.output import pictures3d
 from uem_dolfinx.output.frames import Frame, Gathering, Pieces, Shape, grid
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -77,6 +76,8 @@ class Drawing:
             if problem.comm.rank == 0:
                 _check_colours(cmap)
         if gdim == 3:
+            from uem_dolfinx.output import pictures3d
+
             pictures3d.require(problem.comm)
             low, high = reduced(problem.comm, found, op=MPI.MIN) * [[1.0], [-1.0]]
             if view is None and box is not None:
@@ -315,6 +316,8 @@ class Drawn3D(Drawn):
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import BoundaryNorm, ListedColormap
 
+        from uem_dolfinx.output import pictures3d
+
         n = len(self.bounds) - 1
         colours = ListedColormap(self.cmap(np.linspace(0.0, 1.0, n))).with_extremes(under=self.cmap.get_under())
         self.colours = ScalarMappable(BoundaryNorm(self.bounds, n), colours)
@@ -347,6 +350,8 @@ class Drawn3D(Drawn):
 
 def draw_triad(ax: Any, view: Array, aspect: float) -> None:
     """The axes of the scene as the eye sees them, at the lower left of a panel whose width is ``aspect`` times its height."""
+    from uem_dolfinx.output import pictures3d
+
     right, up = pictures3d.screen(view)
     # as large in small and narrow panels as in others
     extent, inch = ax.get_window_extent(), ax.figure.dpi

@@ -16,7 +16,7 @@ from uem_dolfinx.arrays import Array, Indices, Ints
 from uem_dolfinx.contact.contact import Contact
 from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.geometry.mesh_sizes import FILLED_BY
+from uem_dolfinx.geometry.cells import FILLED_BY
 from uem_dolfinx.geometry.rigid import Motion, RigidSurface
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.parallel import agreed

@@ -19,7 +19,6 @@ from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import InputError, InputTypeError, MissingBackendError, OutputError
 from uem_dolfinx.files import REMEDY
 from uem_dolfinx.geometry.tags import Part
-from uem_dolfinx.output import pictures3d
 from uem_dolfinx.output.drawings import Drawing, checked_size, checked_view, checked_window
 from uem_dolfinx.output.frames import gather_contactors
 from uem_dolfinx.parallel import agreed, ask
@@ -289,6 +288,8 @@ def plot_setup(
             for place, way, name in arrows
         ]
     if gdim == 3:
+        from uem_dolfinx.output import pictures3d
+
         pictures3d.require(problem.comm)
     found, file = Declarations(problem, at, loads).found, BytesIO()
     with panel_of(file if picture is ... else picture, problem.comm, size, dpi) as panel:

@@ -26,7 +26,6 @@ from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.errors import TunnellingError
 from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.crossings import Crossings, cross_target, entries_and_exits
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
@@ -34,6 +33,7 @@ from uem_dolfinx.geometry.sharp import SHARP_EDGE, to_mean
 from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
+    from uem_dolfinx.geometry.crossings import Crossings
     from uem_dolfinx.geometry.neighbours import Neighbour
 
 #: A contactor passes through a target when it is deeper inside on its way than this part of the target's stride.
@@ -144,6 +144,8 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     depth = np.zeros(len(points))
     if not any(comm.allgather(len(near))):
         return depth
+    from uem_dolfinx.geometry.crossings import cross_target
+
     x, ends = points[near], target.facets.x
     found = cross_target(target, near, (x - way[near], x), (ends - moved, ends), reach, target.told(near), target.may_touch)
     entry, out, inside = _inside(found, length[found.point], reach, moving & ~pair.trial.active)
@@ -169,6 +171,8 @@ def _inside(found: Crossings, way: Array, reach: float, at_all: Bools) -> tuple[
     Returns:
         Crossings by which passing contactors enter, crossings by which others leave without having entered, and the former's depths.
     """
+    from uem_dolfinx.geometry.crossings import entries_and_exits
+
     entry, leaving, out = entries_and_exits(found)
     cosine = _dot(found.normal[entry], found.normal[leaving])
     # half of the way between two faces where they are parallel, less where they meet
@@ -198,6 +202,8 @@ def _through_itself(pair: Interface, target: Neighbour, du: Array, moving: bool)
     farthest = reduced(config.comm, float(np.linalg.norm(now - before, axis=1).max(initial=0.0)), op=MPI.MAX)
     if 2.0 * farthest <= target.stride:
         return depth, facet
+    from uem_dolfinx.geometry.crossings import cross_target
+
     reach, nodes = PASSAGE_DEPTH * target.stride, pair.nodes[which]
     found = cross_target(
         target, which, (before[nodes], now[nodes]), (before[target.dofs], now[target.dofs]), reach, target.told(which),

@@ -16,7 +16,6 @@ import numpy as np
 from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.conditions.seams import seams_of
 from uem_dolfinx.contact.both_sides import OfBothSides
-from uem_dolfinx.contact.mortar.placement import Contactors
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.errors import ConvergenceError, OverdeterminedError, UEMError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -96,7 +95,11 @@ def warn_of_seams(pairs: Sequence[Interface]) -> None:
     """
     for pair in pairs:
         config, seams = pair.config, seams_of(pair.config)
-        if seams is None or not isinstance(pair.discretisation, Contactors):
+        if seams is None:
+            continue
+        from uem_dolfinx.contact.mortar.placement import Contactors
+
+        if not isinstance(pair.discretisation, Contactors):
             continue
         is_contactor = np.zeros((config.n_owned, 1))
         is_contactor[pair.nodes] = 1.0

@@ -22,7 +22,6 @@ from uem_dolfinx.contact.warnings.checks import CONFORMING, facet_curvatures
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of, nodes_of_facets
-from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import MeshTarget, nearest_of
 from uem_dolfinx.geometry.sharp import CORNER, sharp_nodes
@@ -107,7 +106,7 @@ class TargetCorners:
         self.smallest = -lowest
 
     @cached_property
-    def surface(self) -> tuple[JoinedTarget | None, Ints]:
+    def surface(self) -> tuple[Any, Ints]:
         """Surfaces of the contactors, and which of these each contact has ``(n_pairs,)``; -1 inside a body (first time: collective).
 
         A surface inside a body has no outer side from which a corner could enter.
@@ -121,7 +120,11 @@ class TargetCorners:
         place = {key: k for k, key in enumerate(key for key, facets in found.items() if facets is not None)}
         of_contact = np.array([place.get(id(tag), -1) for tag in self._tags])
         surfaces = [facets for facets in found.values() if facets is not None]
-        return JoinedTarget(JoinedFacets(self._config, surfaces), False, of_contact) if surfaces else None, of_contact
+        if not surfaces:
+            return None, of_contact
+        from uem_dolfinx.geometry.joined import JoinedFacets, JoinedTarget
+
+        return JoinedTarget(JoinedFacets(self._config, surfaces), False, of_contact), of_contact
 
     @timed("corners of the target")
     def find(self, stiffness: Array, checked: Bools) -> dict[int, CornerInside]:

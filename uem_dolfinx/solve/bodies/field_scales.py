@@ -7,7 +7,7 @@ that neither a rigid translation nor a temperature far from zero makes an equati
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from petsc4py import PETSc
@@ -15,9 +15,11 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Ints
-from uem_dolfinx.geometry.fields import Unknowns
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.solve.bodies.tangent import Tangent
+
+if TYPE_CHECKING:
+    from uem_dolfinx.geometry.fields import Unknowns
 
 #: A norm of forces; in mixed problems one for each field, with the displacement's first ``(n_fields,)``.
 Norm: TypeAlias = float | Array
