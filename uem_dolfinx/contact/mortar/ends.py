@@ -21,8 +21,9 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.contact.mortar.duals import add_up, basis_of
+from uem_dolfinx.contact.mortar.points import SegmentPoints
 from uem_dolfinx.contact.mortar.segment_motions import Motions, Sides, dual_tangents, ring_of, skew, sum_of_products
-from uem_dolfinx.contact.mortar.tangent import SegmentPoints
+from uem_dolfinx.contact.mortar.tangent import inner_curvature, stretched_means
 from uem_dolfinx.geometry.shapes import FacetShape, tangents
 
 #: Pairs of facets whose second derivatives are made at once, in a few times the memory that these take. [bound; pairs; -]
@@ -39,7 +40,7 @@ def curvature(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
     Returns:
         Lists of global nodes ``(p, c)`` and symmetric blocks ``(p, c gdim, c gdim)``.
     """
-    return [at.curvature(alone) for alone in _some_at_once(at, pressure)] + _at_ends(at, pressure)
+    return [inner_curvature(at, alone) for alone in _some_at_once(at, pressure)] + _at_ends(at, pressure)
 
 
 def own_curvature(at: SegmentPoints, pressure: Array) -> Iterator[tuple[slice, Ints, Array]]:
@@ -51,7 +52,7 @@ def own_curvature(at: SegmentPoints, pressure: Array) -> Iterator[tuple[slice, I
     (_, nc), g = pressure.shape, at.x.shape[2]
     if not at.unequal:
         for alone in _some_at_once(at, pressure):
-            nodes, rows = at.curvature(alone, own=True)
+            nodes, rows = inner_curvature(at, alone, own=True)
             yield slice(nc), nodes, rows.reshape(len(nodes), nc, g, nodes.shape[1], g)
     for j, one in enumerate(np.eye(nc)):
         for nodes, blocks in (curvature if at.unequal else _at_ends)(at, pressure * one):
@@ -73,7 +74,7 @@ def _at_ends(at: SegmentPoints, pressure: Array) -> list[tuple[Ints, Array]]:
     """What ``curvature`` has from the target's ends."""
     if at.other is None:
         return []
-    which = at.partly_covered()
+    which = at.bounded()
     which = which[(pressure[at.facet[which]] != 0).any(axis=1)]
     if not len(which):
         return []
@@ -141,9 +142,9 @@ class _Ends:
         of_b = np.einsum("qb,qbf->qf", with_b, np.einsum("qaf,ab->qbf", tab.dN, np.linalg.inv(basis_of(at.shape).T)))
         if at.radius is not None:
             # circumferences grow with the point's outward motion, and with the nodes
-            r, wider = np.einsum("qa,qa->q", s.motions.phi, at.x[e][:, :, 0]), np.zeros(v.shape)
+            r, wider = np.einsum("qa,qa->q", s.phi, at.x[e][:, :, 0]), np.zeros(v.shape)
             of_b += (h / r)[:, None] * np.einsum("qaf,qa->qf", tab.dN, at.x[e][:, :, 0])
-            wider[:, : s.motions.nc, 0] = s.motions.phi / r[:, None]
+            wider[:, : s.motions.nc, 0] = s.phi / r[:, None]
             half += sum_of_products(s.pair, s.weight * h, wider, v, k)
         weight = s.weight * h
         for f in range(at.shape.dim):
@@ -157,8 +158,10 @@ class _Ends:
             return half
         # rotation of sides; area vectors are bilinear
         along = np.einsum("qfg,qg->qf", over, s.ahead)
-        climb = np.einsum("qa,qag,qg->q", s.shift, at.y[self.which[s.pair]], n) - np.einsum("qf,qf->q", high, along)
-        step = Motions(np.einsum("qaf,qf->qa", tab.dN, along), s.shift, climb / size, s.motions.turning)
+        places, (_, nc) = np.concatenate([at.x[e], at.y[self.which[s.pair]]], axis=1), at.nodes.shape
+        climb = np.einsum("qa,qag,qg->q", s.shift, places, n) - np.einsum("qf,qf->q", high, along)
+        own = np.einsum("qaf,qf->qa", tab.dN, along) - s.shift[:, :nc]
+        step = Motions(own, s.shift[:, nc:], climb / size, s.motions.turning)
         half += sum_of_products(s.pair, 0.5 * weight, s.motions.along(s.outward), step.along(s.ahead), k)
         half -= sum_of_products(s.pair, 0.5 * weight, s.motions.along(s.ahead), step.along(s.outward), k)
         ring = ring_of(at.shape)
@@ -172,7 +175,7 @@ class _Ends:
         """Half of the terms of points at which sides leave the contactor facet, which move along its sides."""
         e = self.at.facet[self.which[s.pair]]
         _, h, _, _ = self._factors(e, s)
-        return sum_of_products(s.pair, 0.5 * s.weight * h, -s.way, -s.motions.along(s.cut), len(self.which))
+        return sum_of_products(s.pair, 0.5 * s.weight * h, -s.way, s.cut, len(self.which))
 
     def _in_the_mean(self, s: Sides) -> Iterator[tuple[Ints, Array]]:
         """Terms through c and w, which couple all opposite facets of a contactor facet."""
@@ -203,26 +206,19 @@ class _Ends:
         facet = at.facet[which]
         if at.unequal:
             # parts that do not grow alike change the mean as ends do: once for each facet
-            _, _, means, moved = at.stretched_means(inner, self.pressure)
+            _, _, means, moved = stretched_means(at, inner, self.pressure)
             first, grown = np.unique(facet, return_index=True)[1], np.zeros((k, nc, width))
             y[first, :, : nc * g] += moved[facet[first]]
             grown[first, :, : nc * g] = means[facet[first]]
-            yield self._of_pairs(grown, ends)
-        yield self._of_pairs(z, y)
+            yield from self._of_pairs(grown, ends)
+        yield from self._of_pairs(z, y)
 
-    def _of_pairs(self, left: Array, right: Array) -> tuple[Ints, Array]:
+    def _of_pairs(self, left: Array, right: Array) -> Iterator[tuple[Ints, Array]]:
         """Products of changes ``(p, nc, (nc + nt) gdim)`` of all pairs of a contactor facet, with what they have in common."""
-        at, which, facet = self.at, self.which, self.at.facet[self.which]
-        nc, nt, g = at.nodes.shape[1], at.opposite.shape[1], at.x.shape[2]
-        here = np.flatnonzero(left.any(axis=(1, 2)))
-        i, j = np.nonzero(facet[here, None] == facet[None, :])
-        i = here[i]
-        left_part, right_part = np.zeros((2, len(i), nc, nc + 2 * nt, g))
-        left_part[:, :, : nc + nt] = left[i].reshape(len(i), nc, nc + nt, g)
-        own = right[j].reshape(len(i), nc, nc + nt, g)
-        right_part[:, :, :nc], right_part[:, :, nc + nt :] = own[:, :, :nc], own[:, :, nc:]
-        wide = (nc + 2 * nt) * g
-        parts = (part.reshape(len(i), nc, wide) for part in (left_part, right_part))
-        half = next(parts).transpose(0, 2, 1) @ at.duals.inverse[facet[i]] @ next(parts)
-        nodes = np.concatenate([at.nodes[facet[i]], at.opposite[which[i]], at.opposite[which[j]]], axis=1)
-        return nodes, half + half.transpose(0, 2, 1)
+        at = self.at
+        shape = (-1, at.nodes.shape[1], at.nodes.shape[1] + at.opposite.shape[1], at.x.shape[2])
+        left, right = left.reshape(shape), right.reshape(shape)
+        for places, nodes in at.in_facets(self.which):
+            inverse = at.duals.inverse[at.facet[self.which[places[:, 0]]]]
+            half = at.of_facets(left[places]).transpose(0, 2, 1) @ inverse @ at.of_facets(right[places])
+            yield nodes, half + half.transpose(0, 2, 1)

@@ -13,6 +13,7 @@ from uem_dolfinx.conditions.seams import seams_of
 from uem_dolfinx.contact.mortar.duals import Basis, basis_of
 from uem_dolfinx.contact.mortar.ends import curvature
 from uem_dolfinx.contact.mortar.rows import Elimination, Remembered, Terms, WeightedRows, terms_of
+from uem_dolfinx.contact.mortar.tangent import area_derivatives
 from uem_dolfinx.contact.mortar.turning import Frictional, turning
 from uem_dolfinx.contact.seam.base import OnTarget, PlacedOnTarget
 from uem_dolfinx.contact.seam.ends import Ends, slide_off
@@ -218,7 +219,7 @@ class MortarKinematics(PlacedOnTarget):
         from uem_dolfinx.contact.seam.relative_motion import dyads
 
         of, rows, at = self.of, self.rows, self.rows.points
-        on_facet, on_target = at.area_derivatives(of.growth(rows.facets, at.x))
+        on_facet, on_target = area_derivatives(at, of.growth(rows.facets, at.x))
         terms = terms_of(at.nodes, at.nodes, on_facet), terms_of(at.nodes[at.facet], at.opposite, on_target)
         full, slopes = of.share_slopes(rows.facets, at.x)
         shares, whole_area = (

@@ -15,7 +15,8 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_groups
 from uem_dolfinx.conditions.seams import Seam, Seams
 from uem_dolfinx.contact.mortar.duals import basis_of
-from uem_dolfinx.contact.mortar.tangent import SegmentPoints
+from uem_dolfinx.contact.mortar.points import SegmentPoints
+from uem_dolfinx.contact.mortar.tangent import gap_derivatives
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import TargetFacets, facets_of
 from uem_dolfinx.geometry.overlaps import Segments
@@ -173,7 +174,7 @@ class Elimination:
         Returns:
             Terms, and each facet's part of its nodes' own derivatives ``(m, nc, gdim)``.
         """
-        on_facet, on_target = at.gap_derivatives()
+        on_facet, on_target = gap_derivatives(at)
         terms = [terms_of(at.nodes, at.nodes, -on_facet), terms_of(at.nodes[at.facet], at.opposite, -on_target)]
         variation = row, term, value = self.at_owners(terms, scale)
         own = np.einsum("ng,ng->n", self.of_themselves(plain, variation), plain.direction)

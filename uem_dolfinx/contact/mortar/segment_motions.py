@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,8 +22,12 @@ class Motions:
     part: Array  # gap over the size of the contactor facet ``(q,)``
     turning: Array  # derivative of its area vector a by the displacements ``(q, nc, gdim, gdim)``
 
-    def __getitem__(self, which: Bools) -> Motions:
+    def __getitem__(self, which: Bools | Ints) -> Motions:
         return Motions(self.phi[which], self.N[which], self.part[which], self.turning[which])
+
+    def with_those(self, others: Motions) -> Motions:
+        """Motions of these points, then of others."""
+        return Motions(*(np.concatenate([getattr(one, f.name) for one in (self, others)]) for f in fields(self)))
 
     @property
     def nc(self) -> int:
@@ -46,58 +51,64 @@ class Motions:
 
 @dataclass(frozen=True)
 class Sides:
-    """Points on sides of target facets over contactor facets."""
+    """Points on sides of target facets over contactor facets, and on chords of the contactor's sides over target facets."""
 
     pair: Ints  # number of the pair of facets, ascending ``(q,)``
     xi: Array  # reference coordinates on the contactor's facets ``(q, fdim)``
     b: Array  # values of the contactor's basis functions ``(q, nc)``
+    phi: Array  # its shape functions ``(q, nc)``
     N: Array  # the target's shape functions ``(q, nt)``
     gap: Array  # ``(q,)``
     offset: Array  # part of the gap that is an offset ``(q,)``
     t: Array  # derivative of the gap by the position ``(q, gdim)``
     slope: Array  # derivative of the gap outward across the side ``(q,)``
-    outward: Array  # direction out of the target facet across the side, in the contactor's plane ``(q, gdim)``
-    motions: Motions  # motions of the points relative to the target
+    outward: Array  # direction out of the facet across its side, in the contactor's plane ``(q, gdim)``
+    motions: Motions  # motions of the points relative to the side
     way: Array  # displacement of the contactor outward past the side, a linear function of the nodes ``(q, nc + nt, gdim)``
     ahead: Array  # direction along the side in that plane; zero in 2D ``(q, gdim)``
-    shift: Array  # derivative of the target's shape functions along ``ahead`` ``(q, nt)``
-    #: displacement along the side, per motion, of the point where the side leaves the contactor facet; else zero ``(q, gdim)``.
+    shift: Array  # derivative of the functions of the side's nodes along ``ahead`` ``(q, nc + nt)``
+    #: Displacement along the side of the point where it leaves the other facet, as ``way``; zero elsewhere ``(q, nc + nt, gdim)``.
     cut: Array
     weight: Array  # of the quadrature, a length in 3D; in axisymmetry ``2 pi r`` ``(q,)``
-    end: Bools  # whether the target ends there ``(q,)``
+    end: Bools  # whether the covered part ends there ``(q,)``
 
     def gap_changes(self, n: Array, size: Array) -> Array:
         """Derivatives of the gaps, with normals ``(q, gdim)`` and sizes ``(q,)`` of the contactor facets ``(q, nc + nt, gdim)``."""
         part = self.gap / size
-        fixed = Motions(self.motions.phi, self.N, part, self.motions.turning)
+        fixed = Motions(self.phi, self.N, part, self.motions.turning)
         return fixed.along(self.t) + fixed.of_area(part[:, None] * n)
 
     def at_ends(self) -> Sides:
-        """Points where the target ends."""
+        """Points where the covered part ends."""
         return self.take(self.end)
 
     def between(self) -> Sides:
         """Points between two target facets."""
         return self.take(~self.end)
 
-    def take(self, which: Bools) -> Sides:
+    def with_those(self, others: Sides) -> Sides:
+        """These points, then others."""
+        both = {f.name: (getattr(self, f.name), getattr(others, f.name)) for f in fields(self) if f.name != "motions"}
+        joined: dict[str, Any] = {name: np.concatenate(parts) for name, parts in both.items()}
+        return Sides(motions=self.motions.with_those(others.motions), **joined)
+
+    def take(self, which: Bools | Ints) -> Sides:
         """Some of the points."""
         return Sides(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
-@dataclass(frozen=True)
-class SidePoints:
-    """Points on straight sides of target facets over contactor facets, in the planes of the contactor facets."""
+class SidePoints(NamedTuple):
+    """Points on straight sides of facets over other facets, in the planes of the contactor facets."""
 
     pair: Ints  # number of the pair of facets, ascending ``(q,)``
     at: Array  # positions ``(q, fdim)``
-    eta: Array  # reference coordinates on the target facets ``(q, fdim)``
-    outward: Array  # direction out of the target facet ``(q, fdim)``
+    eta: Array  # reference coordinates on the facets of these sides ``(q, fdim)``
+    outward: Array  # direction out of these facets ``(q, fdim)``
     ahead: Array  # direction along the side, zero in 2D ``(q, fdim)``
     stride: Array  # derivative of ``eta`` along ``ahead`` ``(q, fdim)``
     weight: Array  # of the quadrature, a length in 3D; 1 in 2D ``(q,)``
-    cut: Array  # as in ``Sides``, per motion in the plane ``(q, fdim)``
-    corners: Ints  # corners of the side, as numbers within the target facet ``(q, gdim - 1)``
+    cut: Array  # displacement along the side, per motion of the other facet's side there; zero but where it leaves this ``(q, fdim)``
+    corners: Ints  # corners of the side, as numbers within the facet ``(q, gdim - 1)``
 
 
 def ends(own: Array, other: FacetShape, its: Array) -> SidePoints:
@@ -116,20 +127,21 @@ def ends(own: Array, other: FacetShape, its: Array) -> SidePoints:
     return SidePoints(pair, at, other.nodes[corner], out, none, none, np.ones(len(pair)), none, corner[:, None])
 
 
-def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bool = False) -> SidePoints:
-    """Quadrature points on the straight sides of target facets over contactor facets in 3D; other arguments as in ``ends``.
+def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bool = False, closed: bool = False) -> SidePoints:
+    """Quadrature points on the straight sides of some facets over others in 3D.
 
     Args:
-        shape: of the contactor facets.
-        own: ``(p, nc, 3)``.
-        other: shape of the target facets.
-        its: ``(p, nt, 3)``.
-        cuts: instead, points where sides leave contactor facets, with weight 1 at the end of a side and -1 at its beginning.
+        shape: of the facets below.
+        own: their nodes in the planes ``(p, nc, 3)``.
+        other: shape of the facets with the sides.
+        its: their nodes ``(p, nt, 3)``.
+        cuts: instead, points where sides leave the facets below, with weight 1 at the end of a side and -1 at its beginning.
+        closed: whether sides that coincide with sides of the facets below are over these.
     """
     ring = np.array(other.ring)
     start, end = its[:, ring, :2], its[:, np.roll(ring, -1), :2]
     low, high = np.zeros(start.shape[:2]), np.ones(start.shape[:2])
-    # sides of the contactor facet that cut the target sides, -1 for none
+    # sides of the facet below that cut them, -1 for none
     none: Ints = np.full(low.shape, -1, dtype=np.int64)
     cut_low, cut_high = none, none
     frame = own[:, shape.ring, :2]
@@ -138,8 +150,7 @@ def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bo
     for j in range(frame.shape[1]):
         corner, along = frame[:, None, j], borders[:, None, j]
         before, after = turn * cross(along, start - corner), turn * cross(along, end - corner)
-        # a side that coincides with a side of the contactor facet is not over the facet
-        least = SLIVER * np.einsum("pkf,pkf->pk", along, along)
+        least = (-SLIVER if closed else SLIVER) * np.einsum("pkf,pkf->pk", along, along)
         enters, leaves = (before <= least) & (after > least), (before > least) & (after <= least)
         crossing = before / np.where(enters | leaves, before - after, 1.0)
         later, sooner = enters & (crossing > low), leaves & (crossing < high)
@@ -149,7 +160,7 @@ def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bo
     pair, side = np.nonzero(high > low)
     low, high = low[pair, side], high[pair, side]
     points, weights = side_rule(shape)
-    # positions on sides, their weights, and the sides of contactor facets there
+    # positions on sides, their weights, and the sides of facets below there
     part, first = low[:, None] + (high - low)[:, None] * points[:, 0], (high - low)[:, None] * weights
     border: Ints = np.zeros(part.shape, dtype=np.int64)
     if cuts:
@@ -176,7 +187,7 @@ def edges(shape: FacetShape, own: Array, other: FacetShape, its: Array, cuts: bo
 
 
 def side_rule(shape: FacetShape) -> tuple[Array, Array]:
-    """Quadrature on sides over contactor facets of a ``shape`` in 3D; a single point in 2D."""
+    """Quadrature on sides over facets of a ``shape`` in 3D; a single point in 2D."""
     if shape.dim == 1:
         return np.zeros((1, 0)), np.ones(1)
     # bilinear functions have degree 2 along a line across

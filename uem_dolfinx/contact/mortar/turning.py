@@ -16,9 +16,9 @@ import numpy as np
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.mortar.duals import add_up, basis_of, products
 from uem_dolfinx.contact.mortar.ends import own_curvature
+from uem_dolfinx.contact.mortar.points import SegmentPoints
 from uem_dolfinx.contact.mortar.rows import Elimination, Terms, WeightedRows, add_up_terms, terms_of
 from uem_dolfinx.contact.mortar.segment_motions import Motions, dual_tangents, sum_of_products
-from uem_dolfinx.contact.mortar.tangent import SegmentPoints
 from uem_dolfinx.geometry.shapes import FacetShape, tangents
 
 
@@ -72,28 +72,28 @@ def handing_on(at: SegmentPoints, traction: Array) -> list[tuple[Ints, Array]]:
 
 def _at_ends(at: SegmentPoints, other: FacetShape, traction: Array) -> list[tuple[Ints, Array]]:
     """What ``handing_on`` has from ends of the target, of facets of the shape ``other``: of each pair, and through the facet's mean."""
-    which = at.partly_covered()
+    which = at.bounded()
     which = which[traction[at.facet[which]].any(axis=(1, 2))]
     s = at.sides(other, which).at_ends()
     if not len(s.pair):
         return []
     facet, k, (nc, g), nt = at.facet[which], len(which), traction.shape[1:], at.opposite.shape[1]
     of_share, of_mean = at.duals.spread(facet[s.pair], s.b, traction)
-    left = np.concatenate([s.motions.phi, -s.N], axis=1)[:, :, None] * of_share[:, None]
+    left = np.concatenate([s.phi, -s.N], axis=1)[:, :, None] * of_share[:, None]
     left[:, :nc] += basis_of(at.shape).T.T @ of_mean
     local = sum_of_products(s.pair, -s.weight, left, s.way, k)
     width = (nc + nt) * g
     means = add_up(s.pair, products(of_mean.reshape(-1, nc * g), (-s.way * s.weight[:, None, None]).reshape(-1, width)), k)
+    found = [(np.concatenate([at.nodes[facet], at.opposite[which]], axis=1), local)]
     # the target's shape functions are projected onto the whole facet, with all that is opposite of it
-    here = np.flatnonzero(means.any(axis=1))
-    i, j = np.nonzero(facet[here, None] == facet[None, :])
-    i = here[i]
-    projected = at.duals.inverse[facet[j]] @ at.covered.N[which[j]]
-    out = np.zeros((len(i), nc + 2 * nt, g, nc + 2 * nt, g))
-    out[:, nc + nt :, :, : nc + nt] = -np.einsum("pbl,pbgah->plgah", projected, means.reshape(k, nc, g, nc + nt, g)[i])
-    nodes = np.concatenate([at.nodes[facet], at.opposite[which]], axis=1)
-    size = (nc + 2 * nt) * g
-    return [(nodes, local), (np.concatenate([nodes[i], at.opposite[which[j]]], axis=1), out.reshape(-1, size, size))]
+    for places, nodes in at.in_facets(which):
+        f, width = nodes.shape
+        projected = at.duals.inverse[facet[places]] @ at.covered.N[which[places]]
+        change = at.of_facets(means.reshape(k, nc * g, nc + nt, g)[places]).reshape(f, nc, g, width * g)
+        out = np.zeros((f, width, g, width * g))
+        out[:, nc:] = -np.einsum("fcbl,fbgw->fclgw", projected, change).reshape(f, width - nc, g, width * g)
+        found.append((nodes, out.reshape(f, width * g, width * g)))
+    return found
 
 
 def _stretched(at: SegmentPoints, traction: Array, which: Ints, q: Ints, pair: Ints) -> Array:
@@ -147,7 +147,7 @@ def row_slopes(elimination: Elimination, rows: WeightedRows, which: Ints, unit: 
         grown += np.einsum("mjb,bj,mbag->mjag", (at.duals.C != 0).astype(float), basis_of(at.shape).T, on_facet)
     parts = [terms_of(at.nodes, at.nodes, np.concatenate([np.zeros((m, nc, nc, g * g + g)), grown], axis=3))]
     if at.other is not None:
-        ends = at.partly_covered()
+        ends = at.bounded()
         sides = at.sides(at.other, ends).at_ends()
         pair = ends[sides.pair]
         e = at.facet[pair]
