@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar, cast
@@ -192,7 +193,7 @@ class Exchange:
             self._received = np.empty_like(self._sent)
             comm.Alltoall(self._sent, self._received)
         in_order = comm.size == 1 and bool((self.rows == np.arange(len(self.rows))).all())
-        self._picked: Any = slice(len(self.rows)) if in_order else self.rows
+        self._pick = itemgetter(slice(len(self.rows)) if in_order else self.rows)
 
     @classmethod
     def to(cls, comm: MPI.Comm, rank: Ints) -> Exchange:
@@ -210,15 +211,14 @@ class Exchange:
 
     def send(self, *arrays: AnyArray) -> list[AnyArray]:
         """Rows of ``arrays (n, ...)`` that other ranks and this one send here ``(n_received, ...)``, in their order (collective)."""
-        return self._exchange([a[self._picked] for a in arrays], self._sent, self._received)
+        rows = list(map(self._pick, arrays))
+        return rows if self.comm.size == 1 else self._exchange(rows, self._sent, self._received)
 
     def back(self, *arrays: AnyArray) -> list[AnyArray]:
         """Replies ``(n_sent, ...)`` for ``rows``, from ``arrays (n_received, ...)`` with replies to the received rows (collective)."""
-        return self._exchange(list(arrays), self._received, self._sent)
+        return list(arrays) if self.comm.size == 1 else self._exchange(list(arrays), self._received, self._sent)
 
     def _exchange(self, arrays: list[AnyArray], sent: AnyArray, received: AnyArray) -> list[AnyArray]:
-        if self.comm.size == 1:
-            return arrays
         row = np.dtype([(str(i), a.dtype, a.shape[1:]) for i, a in enumerate(arrays)])
         out, into = np.empty(sent.sum(), row), np.empty(received.sum(), row)
         for i, a in enumerate(arrays):

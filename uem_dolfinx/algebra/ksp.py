@@ -106,6 +106,7 @@ class KspOfOptions(Returning):
         #: Whether the KSP is for symmetric matrices, and the types of KSP and PC in the options.
         self._symmetric = True
         self._types = self.ksp.getType(), self.pc.getType()
+        self.iterative: bool = self._types[0] != "preonly"  # whether solves have a tolerance
 
     @contextmanager
     def _in_database(self, **instead: Any) -> Iterator[None]:
@@ -120,11 +121,6 @@ class KspOfOptions(Returning):
                 if self._unused and compat.petsc_option_used(prefix + key) is not False:
                     self._unused.discard(key)
                 del database[prefix + key]
-
-    @property
-    def iterative(self) -> bool:
-        """Whether solves have a tolerance."""
-        return bool(self.ksp.getType() != "preonly")
 
     def _adapt(self, symmetric: bool) -> None:
         """Use the KSP and PC of the options, or their replacements for unsymmetric matrices."""
