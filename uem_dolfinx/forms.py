@@ -386,10 +386,7 @@ def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec
 def solve_mass(M: PETSc.Mat, rhs: PETSc.Vec, nothing: float, rtol: float) -> tuple[PETSc.Vec, int]:
     """``M^-1 rhs`` of a mass matrix by CG, zero where its diagonal is at most this part of the largest entry (collective).
 
-    Rows without mass become rows of the identity.
-
-    Returns:
-        The solution, and KSP's reason to stop, negative without convergence.
+    Rows without mass become rows of the identity. Returns the solution, and KSP's reason to stop, negative without convergence.
     """
     diagonal = M.getDiagonal()
     massless = diagonal.array_r <= nothing * diagonal.max()[1]

@@ -41,11 +41,10 @@ SOLVED = 1e-10
 def contact_tractions(problem: UnitedProblem) -> tuple[fem.Function, Any] | None:
     """Nominal tractions t of all contacts with ``∫ t . v = f(v)`` for every v of the displacement's space (collective).
 
-    The nodal contact forces f of both sides are those of the equilibrium, whichever coupling they come from. So t is in equilibrium with
-    the bodies, and acts on contactors and targets alike. Tractions are linear on linear cells, and quadratic on quadratic ones.
-
-    Returns:
-        t per undeformed area, zero beyond the surfaces, and the measure of the surfaces; None without surfaces.
+    The nodal contact forces f of both sides are those of the equilibrium, whichever coupling they come from. So t is in
+    equilibrium with the bodies, and acts on contactors and targets alike. Tractions are linear on linear cells, and quadratic on
+    quadratic ones. Returns t per undeformed area, zero beyond the surfaces, and the measure of the surfaces; None without
+    surfaces.
     """
     config = problem.config
     V = config.u.function_space

@@ -241,9 +241,7 @@ class _Patches:
         """Fit polynomials to values ``(n, n_samples, s)`` at samples ``x (n, n_samples, gdim)`` of cells (collective).
 
         A vertex with too few cells around it has the mean of the polynomials of their other vertices, as those inside bodies.
-
-        Raises:
-            InputError: if no vertex has enough cells.
+        Raises InputError if no vertex has enough cells.
         """
         vertices, m, nodes = self._vertices[cells], len(self._powers), self._nodes
         phi = self._monomials(x[:, None] - nodes.X[vertices][:, :, None])

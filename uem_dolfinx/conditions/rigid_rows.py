@@ -309,11 +309,9 @@ class RigidRows:
     def curvature(self, forces: Array) -> tuple[Ints, Array] | None:
         """Geometric stiffness of the rotating rows, from the forces of the coupling ``(n_owned, gdim)`` (collective).
 
-        A rotation t changes the moment ``sum r_i x f_i`` by ``(sum r_i f_i' - r_i . f_i) t``, with arms r_i from the point at which loads
-        and reactions act.
-
-        Returns:
-            Global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``, on one rank; None without stiffness.
+        A rotation t changes the moment ``sum r_i x f_i`` by ``(sum r_i f_i' - r_i . f_i) t``, with arms r_i from the point at
+        which loads and reactions act. Returns global nodes ``(1, n)`` and the block of their components ``(1, n gdim, n gdim)``,
+        on one rank; None without stiffness.
         """
         s, config, g, aim = self.set, self._config, self._config.gdim, self._linearised
         if not s.large or self._basis is None or not len(self._basis.node):

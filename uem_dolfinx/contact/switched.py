@@ -51,8 +51,7 @@ def mark(contact: Contact, on: bool) -> None:
 def switch_on(contact: Contact) -> None:
     """Start a contact in the current configuration, as at the start of a problem (collective).
 
-    Raises:
-        PenetrationError: if a contactor is deeper inside than ``max_penetration``.
+    Raises PenetrationError if a contactor is deeper inside than ``max_penetration``.
     """
     pair = contact.pair
     settle(pair)

@@ -341,8 +341,7 @@ def _isotropic(options: dict[str, str]) -> None:
 def model_of(deck: Deck) -> Model:
     """Read the keywords of a deck that are not of its mesh, and name the nodes and sides that they mention as sets and surfaces.
 
-    Raises:
-        InputError: for a keyword that cannot be read, or a deck without a step that is taken.
+    Raises InputError for a keyword that cannot be read, or a deck without a step that is taken.
     """
     reader = _Reader(deck)
     left_out = reader.model.left_out

@@ -170,8 +170,7 @@ class AddedMass:
     def take_out(self, acceleration: Array, part: float) -> Array:
         """Take ``part`` of an acceleration of the nodes ``(n_owned, gdim)`` and its inertia forces out of the committed ones (collective).
 
-        Returns:
-            Those inertia forces at the owned nodes of the set ``(n, gdim)``.
+        Returns those inertia forces at the owned nodes of the set ``(n, gdim)``.
         """
         inertia = self.masses[:, None] * (a := self._carried(acceleration))
         self.acceleration, self.forces = self.acceleration - part * a, self.forces - inertia

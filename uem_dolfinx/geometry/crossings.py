@@ -154,8 +154,7 @@ def entries_and_exits(found: Crossings) -> tuple[Ints, Ints, Ints]:
 def _carried_along(p0: Array, x0: Array, x1: Array, i: Ints, f: Ints) -> tuple[Array, Array]:
     """Points ``p0 (n, gdim)`` and simplices ``x0 (m, gdim, gdim)``, moved by the rigid motions of the simplices to ``x1``.
 
-    Returns:
-        Points ``i (k,)`` moved with simplices ``f (k,)``, ``(k, gdim)``, and these simplices ``(k, gdim, gdim)``.
+    Returns points ``i (k,)`` moved with simplices ``f (k,)``, ``(k, gdim)``, and these simplices ``(k, gdim, gdim)``.
     """
     middle, there = x0.mean(axis=1), x1.mean(axis=1)
     some, which = np.unique(f, return_inverse=True)

@@ -168,9 +168,8 @@ class EdgeGaps:
     def _slopes(self) -> tuple[Array, Array, Array, Array]:
         """Derivatives by the nodes of both lines, the first's first: ``m = 24`` columns.
 
-        Returns:
-            Both coordinates ``(k, 2, m)``; the normal's products with the lines' slopes at fixed coordinates, of the second line
-            negative ``(k, 2, m)``; curvatures of both lines along the normal ``(k, 2)``; the normal ``(k, 3, m)``.
+        Returns both coordinates ``(k, 2, m)``; the normal's products with the lines' slopes at fixed coordinates, of the second
+        line negative ``(k, 2, m)``; curvatures of both lines along the normal ``(k, 2)``; the normal ``(k, 3, m)``.
         """
         n, g, k = self.normal, self.gap, len(self.s)
         (_, a, da), (_, b, db) = self._first, self._second

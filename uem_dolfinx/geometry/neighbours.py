@@ -235,9 +235,8 @@ class Neighbours:
     def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array, Array, Bools, Bools, Array]:
         """Nodes and this rank's facets that may touch.
 
-        Returns:
-            Indices of nodes, facets, least cosines between their normals, distances, whether they face each other, whether the
-            nodes are in front ``(k,)``, and the facets' normals ``(k, gdim)``.
+        Returns indices of nodes, facets, least cosines between their normals, distances, whether they face each other, whether
+        the nodes are in front ``(k,)``, and the facets' normals ``(k, gdim)``.
         """
         assert self._made_at is not None
         skin, x, points = self.skin, self._made_at[self.skin.dofs], of.points

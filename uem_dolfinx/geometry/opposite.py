@@ -133,10 +133,8 @@ def _balls_along(middle: Array, radius: Array, reach: Array, normal: Array, plac
     """Balls that together cover the given positions within ``reach`` of facets along their normals.
 
     The search region of a facet of ``radius (m,)`` is a tube. One ball around a long tube would contain many facets outside it.
-    Only the part of the tube inside the bounding box of ``places (k, gdim)`` is covered.
-
-    Returns:
-        Middles ``(k, gdim)``, the facet of each ``(k,)`` and radii ``(k,)``.
+    Only the part of the tube inside the bounding box of ``places (k, gdim)`` is covered. Returns middles ``(k, gdim)``, the facet
+    of each ``(k,)`` and radii ``(k,)``.
     """
     box = np.stack([places.min(axis=0), places.max(axis=0)])
     centre, arm = box.mean(axis=0), 0.5 * (box[1] - box[0])

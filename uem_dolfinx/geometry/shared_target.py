@@ -44,9 +44,7 @@ class SharedTarget:
 def shared_target(target: Target, comm: MPI.Comm, gdim: int) -> Target:
     """A target of the user's for a problem in ``gdim`` dimensions (collective).
 
-    Raises:
-        SurfaceError: if it is given in another dimension.
-        InputError: if it is not the same on all ranks.
+    Raises SurfaceError if it is given in another dimension, and InputError if it is not the same on all ranks.
     """
     own, name = getattr(target, "gdim", None), getattr(target, "name", type(target).__name__)
     if own not in (None, gdim):

@@ -121,9 +121,8 @@ class Skin(TargetFacets):
     def _around(self) -> tuple[Ints, Ints, Exchange, Ints, Ints]:
         """Facets of one smooth face that meet at nodes on sharp edges (first time: collective).
 
-        Returns:
-            Facets and their nodes ``(k,)``, their exchange with the owners of the nodes, and pairs of received facets with similar
-            reference normals; each facet also forms a pair with itself.
+        Returns facets and their nodes ``(k,)``, their exchange with the owners of the nodes, and pairs of received facets with
+        similar reference normals; each facet also forms a pair with itself.
         """
         facet, node = np.nonzero(self.on_sides(self.edges.sharp)[self.dofs])
         exchange = Exchange.to(self.config.comm, self.config.owner_of(self.nodes[facet, node]))

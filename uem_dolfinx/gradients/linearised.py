@@ -276,10 +276,8 @@ class Linearised:
     def changes(self, m: ContactParameter, entry: tuple[int, ...]) -> tuple[Array, Array]:
         """Derivatives of gaps and residual by an entry of a contact's parameter, at fixed displacement (collective).
 
-        A motion b(x) of a rigid surface is equivalent to a motion -b of the bodies, and a rotation of its forces.
-
-        Returns:
-            Changes of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
+        A motion b(x) of a rigid surface is equivalent to a motion -b of the bodies, and a rotation of its forces. Returns changes
+        of the gaps of all equations ``(m,)`` and of the residual at the owned nodes ``(n_owned, gdim)``.
         """
         pair, config, gaps = m.contact.pair, self.config, np.zeros_like(self.multipliers)
         if m.parameter == "friction":

@@ -79,8 +79,7 @@ class MeanSlopes:
     def leaning(self, equations: ContactRows) -> tuple[Ints, Ints, Array] | None:
         """What Newton's tangent leaves out of equations along the target (collective).
 
-        Returns:
-            Equations ``(k,)``, nodes that they depend on, -1 for none ``(k, c)``, and coefficients of these ``(k, c, gdim)``.
+        Returns equations ``(k,)``, nodes that they depend on, -1 for none ``(k, c)``, and coefficients of these ``(k, c, gdim)``.
         """
         i = np.flatnonzero(self.stuck)
         made, place = self._slopes(i), np.full(len(self.stuck), -1, dtype=np.int64)

@@ -162,8 +162,7 @@ def is_table(value: Any) -> bool:
 def read_pairs(what: str, points: Any, expected: str) -> tuple[Array, Array]:
     """Plastic strains from 0 upwards and stresses that do not fall, each ``(m,)``.
 
-    Raises:
-        InputTypeError, InputError: for other objects, with the expected form.
+    Raises InputTypeError or InputError for other objects, with the expected form.
     """
     words = given.sentence(what, points, expected)
     try:
@@ -181,8 +180,7 @@ def read_pairs(what: str, points: Any, expected: str) -> tuple[Array, Array]:
 def read_table(points: Any, slope: Any) -> Tabulated:
     """A table of equivalent plastic strain against yield stress, and the slope behind its last point.
 
-    Raises:
-        InputTypeError, InputError: for other objects, with the expected form.
+    Raises InputTypeError or InputError for other objects, with the expected form.
     """
     expected = "pairs (plastic strain, yield stress), strains from 0 upwards, stresses positive and not falling"
     strains, stresses = read_pairs("yield_stress", points, expected)

@@ -43,8 +43,7 @@ class BackTable:
     def read(points: Any) -> BackTable:
         """The table of pairs (plastic strain, back stress), without intermediate points on straight lines.
 
-        Raises:
-            InputTypeError, InputError: for other objects, with the expected form.
+        Raises InputTypeError or InputError for other objects, with the expected form.
         """
         expected = "pairs (plastic strain, back stress) from (0, 0), strains rising, stresses not falling, slopes not rising"
         strains, stresses = read_pairs("kinematic_hardening", points, expected)

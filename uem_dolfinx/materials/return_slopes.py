@@ -355,8 +355,7 @@ class PlasticChanges(PlasticSlopes):
     def begin_along(self, direction: Sequence[tuple[Any, Any]]) -> tuple[Array, fem.Function]:
         """Begin a step, with the law set to its end, along changes of parameters as passed to the law (collective).
 
-        Returns:
-            Changes at the same displacement, of the residual by the stress ``(n,)``, and of ``bulk``.
+        Returns changes at the same displacement, of the residual by the stress ``(n,)``, and of ``bulk``.
         """
         self._state = self._law.begins_with()
         n, k = self._by_stress.shape

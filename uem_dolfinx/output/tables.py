@@ -308,9 +308,8 @@ class Columns:
     def row(self) -> list[float]:
         """The present numbers of all columns (collective if there are columns).
 
-        Raises:
-            InputError, InputTypeError: if a function returns numbers that are not finite, differ between ranks, or changed in number.
-            UserFunctionError: if a function raises an error.
+        Raises InputError or InputTypeError if a function returns numbers that are not finite, differ between ranks, or changed in
+        number, and UserFunctionError if a function raises an error.
         """
         if not self._asked:
             return []

@@ -77,9 +77,8 @@ def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
 def set_loads(comm: MPI.Comm, load: Any, at: float, bcs: Sequence[Any] = ()) -> None:
     """Apply a problem's ``load``, and Dirichlet values by rules, at a load factor or time; None sets nothing (collective).
 
-    Raises:
-        InputError, InputTypeError: if the value of a Constant is not finite, or of another shape.
-        UserFunctionError: if a function raises.
+    Raises InputError or InputTypeError if the value of a Constant is not finite, or of another shape, and UserFunctionError if a
+    function raises.
     """
     if isinstance(load, Mapping):
         for constant, value in load.items():
@@ -367,8 +366,7 @@ def from_checkpoint(problem: Any, kept: list[float | None]) -> tuple[Taken, Take
 def in_rows(problem: Any, held: Array | float) -> Array:
     """Shares of Dirichlet values in the rows of vectors ``(n_rows, gdim)``, zero where free (collective).
 
-    Raises:
-        InputError: for values that are ramped from positions of free nodes, since these depend on all parameters.
+    Raises InputError for values that are ramped from positions of free nodes, since these depend on all parameters.
     """
     bodies = problem.bodies
     unknown = np.flatnonzero(bodies.held & np.isnan(held))

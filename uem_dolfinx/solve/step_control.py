@@ -80,8 +80,7 @@ class StepControl:
     def shorten(self, length: float, error: errors.UEMError, part: float = 0.5) -> bool:
         """Shorten a step of this length that failed to a part of it.
 
-        Returns:
-            Whether to try again: not if the error does not depend on the length, or if the step would become too short.
+        Returns whether to try again: not if the error does not depend on the length, or if the step would become too short.
         """
         mendable, before = isinstance(error, MENDABLE), self._failed
         self._failed = getattr(error, "history", [])

@@ -122,8 +122,7 @@ class Progress:
     def begin_ramp(self, displacement: Array, steps: int) -> bool:
         """Begin a call of ``load_steps`` with a number of steps, or continue the call in which a checkpoint was written.
 
-        Returns:
-            Whether the call has steps to take; False if the checkpoint was written in a later call.
+        Returns whether the call has steps to take; False if the checkpoint was written in a later call.
         """
         self._calls += 1
         if self._calls > self.ramp:
@@ -194,8 +193,7 @@ class Progress:
 def begin_checkpoint(checkpoint: Checkpoint | None, state: Callable[[], State], u: Any) -> None:
     """Begin a checkpoint, unless the caller has begun it with a state of this displacement (collective).
 
-    Raises:
-        CheckpointError: as in ``Checkpoint.begin``, or if it has begun with the state of another problem.
+    Raises CheckpointError as in ``Checkpoint.begin``, or if it has begun with the state of another problem.
     """
     if checkpoint is None:
         return

@@ -326,9 +326,8 @@ class Sliding:
     def turning(self, state: PairState, kinematics: Kinematics) -> tuple[Array, Array, Array]:
         """Derivatives of friction by the slip of slipping contactors.
 
-        Returns:
-            Projectors across the slip directions ``(k, g, g)``, the removed part of the force across them ``(k,)``, and stiffnesses
-            across and, with rate laws, along them ``(k, g, g)``.
+        Returns projectors across the slip directions ``(k, g, g)``, the removed part of the force across them ``(k,)``, and
+        stiffnesses across and, with rate laws, along them ``(k, g, g)``.
         """
         i = self.slipping(state).nonzero()[0]
         T, s = self.frame.tangents[i], self.directions(state)[i]

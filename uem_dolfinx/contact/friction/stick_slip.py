@@ -133,8 +133,7 @@ class FrictionViolations(Violations):
 def tangents(normals: Array, free: Bools) -> Array:
     """Orthonormal directions perpendicular to all normals ``(n, k, gdim)`` in the components ``free (n, gdim)``, padded with zeros.
 
-    Returns:
-        ``(n, gdim - 1, gdim)``.
+    Returns ``(n, gdim - 1, gdim)``.
     """
     first, g = normals[:, 0], normals.shape[2]
     if g == 2:

@@ -112,9 +112,7 @@ class ValuesOfPairs:
 def refuse_words_of_contact(others: Mapping[str, Any]) -> None:
     """Refuse arguments of a ``Contact`` that a general contact has not, unless they have the value of a contact without them.
 
-    Raises:
-        InputTypeError: for such an argument, with the remedy.
-        TypeError: for an argument that a ``Contact`` has not, either.
+    Raises InputTypeError for such an argument, with the remedy, and TypeError for an argument that a ``Contact`` has not, either.
     """
     known = signature(Contact).parameters
     for word, value in others.items():

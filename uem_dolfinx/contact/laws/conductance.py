@@ -129,9 +129,8 @@ class Conductance(given.Sealed):
 def conductances_of(heat: Any) -> tuple[Conductance, ...]:
     """Conductances of a contact, given as one, as a list, or as None.
 
-    Raises:
-        InputTypeError: for anything else.
-        InputError: for two of one field that both are infinite, or that both include the same heat of friction or of a current.
+    Raises InputTypeError for anything else, and InputError for two of one field that both are infinite, or that both include the
+    same heat of friction or of a current.
     """
     some = () if heat is None else (heat,) if hasattr(heat, "conductances") else heat
     fits = isinstance(some, list | tuple) and all(hasattr(one, "conductances") for one in some)

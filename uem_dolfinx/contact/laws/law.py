@@ -132,9 +132,8 @@ def given_friction(friction: Any) -> Field | FrictionLaw:
 def given_normal(normal: Any, friction: Any, wear: Any, heats: Sequence[Any], tied: Any) -> Any:
     """Checked user input for the normal contact: a ``SoftContact``, or None for hard contact.
 
-    Raises:
-        InputTypeError: for another type.
-        InputError: for a soft contact with friction, wear, perfect conductance, heat of currents, or a tie.
+    Raises InputTypeError for another type, and InputError for a soft contact with friction, wear, perfect conductance, heat of
+    currents, or a tie.
     """
     given.kind("normal", normal, normal is None or hasattr(normal, "pressures"), "a SoftContact, or None for hard contact")
     slides = isinstance(friction, dict) or as_law(friction).field != 0.0
@@ -183,9 +182,7 @@ def given_cohesion(cohesion: Any, sliding: str, normal: Any, friction: Any, wear
 def given_leak(leak: Any, normal: Any, cohesion: Any, tied: Any) -> Any:
     """Checked user input for the fluid of a contact: a ``Leak``, or None.
 
-    Raises:
-        InputTypeError: for another type.
-        InputError: for a fluid with a soft contact, cohesion or a tie.
+    Raises InputTypeError for another type, and InputError for a fluid with a soft contact, cohesion or a tie.
     """
     given.kind("leak", leak, leak is None or hasattr(leak, "inlet"), "a Leak, or None")
     for what, there in (("normal", normal), ("cohesion", cohesion), ("tied", tied)):
@@ -211,11 +208,7 @@ def given_together(contact: Any, friction: Any, offset: Any) -> tuple[Any, Any]:
 
 
 def check_tied(tied: Any, offset: Any, wear: Any, friction: Any) -> None:
-    """Refuse what does not go with ``tied = True``.
-
-    Raises:
-        InputError: for an offset, wear or friction.
-    """
+    """Refuse what does not go with ``tied = True``; InputError for an offset, wear or friction."""
     if tied is not True:
         return
     if offset != 0.0:

@@ -273,9 +273,8 @@ class PressureTable:
     def of(cls, table: Any) -> PressureTable:
         """The table of pairs ``(gap, pressure)``.
 
-        Raises:
-            InputTypeError: if it consists of no pairs of numbers.
-            InputError: for gaps that do not ascend, or pressures that increase, are negative, or are not 0 at the last gap.
+        Raises InputTypeError if it consists of no pairs of numbers, and InputError for gaps that do not ascend, or pressures that
+        increase, are negative, or are not 0 at the last gap.
         """
         words = "two or more pairs (gap, pressure), gaps in ascending order, pressures that do not increase and end with 0"
         try:

@@ -77,8 +77,7 @@ class Interface:
     def project(self) -> None:
         """Project the contactors onto the target in the current configuration (collective).
 
-        Raises:
-            NotFiniteError: if the target's functions return values that are not finite.
+        Raises NotFiniteError if the target's functions return values that are not finite.
         """
         if (self.far and not self.asked) or (self.tie is not None and not self.tie.begin_placement()):
             return

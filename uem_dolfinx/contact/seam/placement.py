@@ -259,8 +259,7 @@ class Kinematics(Protocol):
     def follow(self, state: PairState, off: Bools) -> tuple[Kinematics, PairState]:
         """Release contactors ``off (n,)`` the target, follow others from facet to facet, into and out of corners (collective).
 
-        Returns:
-            Kinematics at the same points, the same object on all ranks unless equations change, and the state.
+        Returns kinematics at the same points, the same object on all ranks unless equations change, and the state.
         """
 
     @property

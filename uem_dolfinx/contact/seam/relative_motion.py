@@ -114,8 +114,7 @@ class Terms(NamedTuple):
 def dyads(scale: Array, left: Terms, right: Terms) -> tuple[Ints, Array]:
     """``sum_i scale_i v_i w_i'`` of linear functions v and w of contactors.
 
-    Returns:
-        Global rows ``(k, m)``, -1 for no row, and blocks ``(k, m gdim, m gdim)``.
+    Returns global rows ``(k, m)``, -1 for no row, and blocks ``(k, m gdim, m gdim)``.
     """
     rows, which, v, w = grouped(scale, left, right)
     return rows, scale[which, None, None] * v[:, :, None] * w[:, None, :]

@@ -358,8 +358,7 @@ class Heat:
     def tangent(self) -> list[tuple[Ints, Array]]:
         """Derivatives of the residual by temperatures and gaps (collective).
 
-        Returns:
-            Pairs of global rows ``(k, m)``, -1 for no row, and blocks ``(k, m gdim, m gdim)``.
+        Returns pairs of global rows ``(k, m)``, -1 for no row, and blocks ``(k, m gdim, m gdim)``.
         """
         jumps = self.jumps()
         found = [dyads(scale, jumps, right) for scale, right in self.changes()]
@@ -408,11 +407,7 @@ class Heat:
 
 
 def heats_of(pair: Pair, laws: Sequence[Conductance], contact: Declared, kind: type[Heat]) -> list[Heat]:
-    """Heat flows of an interface by several conductances (collective).
-
-    Raises:
-        InputError, SpaceError: as ``Heat``.
-    """
+    """Heat flows of an interface by several conductances; InputError or SpaceError as ``Heat`` (collective)."""
     columns = np.cumsum([law.perfect for law in laws])
     heats = [kind(pair, law, contact, column - 1) for law, column in zip(laws, columns.tolist())]
     for heat in heats:

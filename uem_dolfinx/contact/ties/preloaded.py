@@ -65,9 +65,8 @@ class Preloaded(Tie):
     def unite(self, state: PairState, projection: Projection, off: Bools, which: Bools | None = None) -> PairState:
         """See ``Tie`` (collective).
 
-        Raises:
-            InputError: if the axis lies in the section.
-            SurfaceError: if conditions prescribe the whole section along the axis.
+        Raises InputError if the axis lies in the section, and SurfaceError if conditions prescribe the whole section along the
+        axis.
         """
         n = projection.normal[self._within_reach(state)].sum(axis=0)
         n = np.asarray(reduced(self.config.comm, n))

@@ -101,11 +101,7 @@ class PartSolver(UnitedSolver):
         return np.zeros(self._used.size)
 
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
-        """Solve for dq, and 1 for the number of linear iterations (collective).
-
-        Raises:
-            LinearSolveError: if the matrix is singular.
-        """
+        """Solve for dq, and 1 for the number of linear iterations; LinearSolveError if the matrix is singular (collective)."""
         with timed("linear solve"):
             dq = self.space.vector(self._uncoupled(rhs))
             if self._pc is not None:

@@ -279,8 +279,7 @@ class Bodies:
     def hold(self, bcs: Sequence[fem.DirichletBC]) -> None:
         """Replace all Dirichlet conditions from the next step on; the ranks that own the nodes decide (collective).
 
-        Raises:
-            InputError: for a component that has a condition on a rank that does not own it, but not on its owner.
+        Raises InputError for a component that has a condition on a rank that does not own it, but not on its owner.
         """
         self.bcs, own = list(bcs), np.zeros(len(self.u.x.array), dtype=bool)
         for bc in self.bcs:

@@ -48,8 +48,7 @@ def advise(error: ConvergenceError, energy: float, largest: float) -> None:
 def refuse_other_laws(contacts: Sequence[Any], materials: Sequence[Any]) -> None:
     """Refuse laws whose dissipation is not measured by load and displacement alone.
 
-    Raises:
-        InputError: for materials with history, for plastic unloading, and for a viscosity, which is a part of the load factor.
+    Raises InputError for materials with history, for plastic unloading, and for a viscosity, which is a part of the load factor.
     """
     for material in materials:
         raise InputError(

@@ -179,8 +179,7 @@ def _by_load(problem: UnitedProblem, tolerance: float | None) -> ByLoad:
 def check_steps(problem: Any, checkpoint: Any) -> None:
     """Refuse arguments of step functions that are no problem or no checkpoint (collective if there is a problem).
 
-    Raises:
-        InputTypeError: for other objects.
+    Raises InputTypeError for other objects.
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):

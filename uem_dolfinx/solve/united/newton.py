@@ -91,8 +91,7 @@ class ContactMethod(Protocol):
     def return_to_targets(self, bound: float) -> bool:
         """Normal return [UEM, 4.2]: move active contactors back onto the moved targets, unless the resulting forces exceed ``bound``.
 
-        Returns:
-            Whether any contactor has been moved by more than rounding of positions; contactors are then projected again.
+        Returns whether any contactor has been moved by more than rounding of positions; contactors are then projected again.
         """
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
