@@ -159,11 +159,7 @@ class OwnFile:
         return os.fstat(self._descriptor).st_size
 
     def check(self, sized: bool = True) -> None:
-        """Refuse to write to a file that was removed or, if ``sized``, whose size was changed by another program.
-
-        Raises:
-            OutputError: in either case.
-        """
+        """OutputError if the file was removed or, if ``sized``, its size was changed by another program."""
         gone, size = not os.fstat(self._descriptor).st_nlink, self.size
         if gone or (sized and size != self._size):
             what = "has been removed or replaced" if gone else f"has been changed, from {self._size} to {size} bytes,"

@@ -84,11 +84,7 @@ def truth(value: Any) -> bool:
 
 
 def numbers(value: Any) -> Array:
-    """Copy of a value as an array of numbers.
-
-    Raises:
-        TypeError: as of other objects, for expressions of UFL, whose conversion never ends, and for True and False.
-    """
+    """Copy of a value as an array of numbers; TypeError as of other objects for expressions of UFL, and for True and False."""
     if symbolic(value) or truth(value):
         raise TypeError("an expression of UFL, or True or False, is no number")
     return np.array(value, dtype=float)
@@ -116,12 +112,7 @@ def fault(values: Array, shape: tuple[int, ...], within: Range, places: Array | 
 
 
 def number(what: str, value: Any, within: Range = FINITE) -> float:
-    """A number of a range.
-
-    Raises:
-        InputTypeError: if it is no real number.
-        InputError: if it is out of the range.
-    """
+    """A number of a range: InputTypeError for anything else, InputError outside of it."""
     words = sentence(what, value, within.words, within.remedy)
     if symbolic(value) or truth(value) or isinstance(value, (str, bytes)) or np.ndim(value):
         raise InputTypeError(words)
@@ -188,12 +179,7 @@ def name(what: str, value: Any, remedy: str = "") -> str:
 
 
 def vector(what: str, value: npt.ArrayLike, size: int | None = None) -> Array:
-    """Copy of finite numbers ``(size,)``, by default 2 or 3 of them.
-
-    Raises:
-        InputTypeError: if they are no numbers.
-        InputError: if their number is wrong, or one is not finite.
-    """
+    """Copy of ``size`` finite numbers, by default 2 or 3; InputTypeError for other objects, InputError for other numbers."""
     expected = f"{'2 or 3' if size is None else size} finite numbers"
     try:
         a = np.atleast_1d(numbers(value))
@@ -244,11 +230,7 @@ def plain(value: Any) -> Any:
 
 
 def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
-    """Refuse values that differ between ranks, which would cause a deadlock (collective).
-
-    Raises:
-        InputError: on all ranks, with the first such value and two ranks.
-    """
+    """InputError on all ranks for values that differ between ranks, which would cause a deadlock (collective)."""
     if comm.size == 1:
         return
     of_ranks = comm.allgather([described(value) for value in values.values()])
@@ -315,11 +297,7 @@ class Sealed:
         return f"counts only as an argument: make a new {kind}{whole}" + (f"; only {more} may be set" if more else "")
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute.
-
-        Raises:
-            InputError: if it is unknown, or an argument that can no longer be changed.
-        """
+        """Set an attribute; InputError if it is unknown, or an argument that can no longer be changed."""
         # code of the package may set all attributes
         if self._made and not name.startswith("_") and not sys._getframe(1).f_globals.get("__name__", "").startswith(PACKAGE):
             if name in self.SETTABLE:

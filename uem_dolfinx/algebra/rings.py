@@ -38,11 +38,7 @@ NODES_TOGETHER = 256
 
 
 class DependentRingError(ConflictError):
-    """Equations that follow each other in a ring and depend on each other.
-
-    Attributes:
-        rows: mask of these equations on this rank ``(m,)``.
-    """
+    """Equations that follow each other in a ring and depend on each other: ``rows (m,)`` masks them on this rank."""
 
     rows: Bools
 

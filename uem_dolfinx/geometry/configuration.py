@@ -21,11 +21,7 @@ from uem_dolfinx.parallel import reduced
 
 
 class Configuration(Nodes):
-    """Nodes of a vector Lagrange space and their current positions ``x = X + u``.
-
-    Raises:
-        SpaceError: if ``u`` is not in a blocked Lagrange space of degree 1 or 2 with one component per coordinate.
-    """
+    """Nodes of a vector Lagrange space of degree 1 or 2 and their positions ``x = X + u``; SpaceError for any other ``u``."""
 
     moves = True  # whether the unknowns move the nodes; a scalar field does not
     name = "displacement"  # name of the solution in results and checkpoints

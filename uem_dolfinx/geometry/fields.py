@@ -302,11 +302,7 @@ def degree_of_displacement(W: Any, i: Any) -> int:
 
 
 class ScalarConfiguration(Configuration):
-    """Nodes of a scalar Lagrange space; arrays of its values have one component, ``(n, 1)``, where others have gdim.
-
-    Raises:
-        SpaceError: if ``u`` is in no Lagrange space of degree 1 or 2, or on a surface in space.
-    """
+    """Nodes of a scalar Lagrange space of degree 1 or 2, in no surface, else a SpaceError; arrays are ``(n, 1)``, not ``(n, gdim)``."""
 
     moves, name = False, "field"
 

@@ -251,11 +251,7 @@ def green_lagrange(u: Any) -> Expr:
 
 
 def check_kind(kind: str, u: Any) -> None:
-    """Refuse a kind that does not fit the number of components of a displacement, or the axisymmetry of its mesh.
-
-    Raises:
-        InputError: with the kinds that fit.
-    """
+    """InputError for a kind that does not fit the displacement's number of components, or the axisymmetry of its mesh."""
     if (len(u) == 3) != (kind == "3d"):
         fitting = "'3d'" if len(u) == 3 else "'plane_strain', 'plane_stress' or 'axisymmetric'"
         raise InputError(f"kind = '{kind}' does not fit a displacement with {len(u)} components: expected {fitting}")

@@ -167,11 +167,7 @@ class Acting:
 
 
 class Actions:
-    """Collects present prescribed values, loads and springs.
-
-    Args:
-        outside: surface of its bodies.
-    """
+    """Collects present prescribed values, loads and springs, at the surface ``outside``."""
 
     def __init__(self, problem: UnitedProblem, outside: Outside):
         self.problem, self.config, self.comm, self._outside = problem, problem.config, problem.comm, outside

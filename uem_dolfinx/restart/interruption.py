@@ -26,11 +26,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class InterruptedStepError(UEMError):
-    """A signal has arrived within a step; always caught by the load and time stepping.
-
-    Attributes:
-        number: of the signal.
-    """
+    """A signal, by its ``number``, has arrived within a step; always caught by the load and time stepping."""
 
     def __init__(self, number: int):
         super().__init__(f"interrupted by {signal.Signals(number).name}")

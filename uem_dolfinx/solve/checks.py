@@ -184,12 +184,7 @@ def check_hold(problem: Any) -> None:
 
 
 def check_conditions(config: Configuration, bcs: Any) -> list[Any]:
-    """The Dirichlet conditions as a list, all of them of the displacement's space or of a part of it.
-
-    Raises:
-        InputTypeError: if they are no list of Dirichlet conditions.
-        SpaceError: names the first condition of another space.
-    """
+    """The Dirichlet conditions as a list; InputTypeError for other objects, SpaceError for conditions of another space."""
     bcs = given.items("bcs", bcs, compat.is_dirichlet, "a Dirichlet condition")
     for i, bc in enumerate(bcs):
         if not compat.is_condition_of(bc, config.whole.function_space):

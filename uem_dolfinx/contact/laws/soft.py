@@ -169,11 +169,7 @@ class SoftContact(given.Sealed):
 
 @dataclass(frozen=True, repr=False)
 class Linear:
-    """``p = -k g`` for g <= 0, else 0.
-
-    Args:
-        k: stiffness per area, a pressure over a length, a number or a Constant.
-    """
+    """``p = -k g`` for g <= 0, else 0; k is a pressure over a length, a number or a Constant."""
 
     k: float | fem.Constant
     rest = 0.0
