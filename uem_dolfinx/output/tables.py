@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 from weakref import WeakValueDictionary
 
 from mpi4py import MPI
@@ -24,17 +24,9 @@ from uem_dolfinx.log import logger, timed
 from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.solve.problem import UnitedProblem
 
-
-class Clock(Protocol):
-    """Progress of a run, in time or in steps, and the number of checkpoints read."""
-
-    @property
-    def time(self) -> float:
-        """Present time, or number of steps."""
-
-    @property
-    def resumed(self) -> int:
-        """Number of checkpoints read."""
+if TYPE_CHECKING:
+    from uem_dolfinx.dynamics.inertia import Dynamics
+    from uem_dolfinx.solve.stepping import Progress
 
 
 class Closing(ABC):
@@ -93,7 +85,7 @@ class CsvTable(Closing):
         path: str | Path,
         comm: MPI.Comm,
         columns: Sequence[str],
-        resume_at: float | Clock | None = None,
+        resume_at: float | Progress | Dynamics | None = None,
         *,
         key: str | None = None,
         words: Sequence[str] = (),

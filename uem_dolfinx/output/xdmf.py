@@ -219,7 +219,9 @@ class XdmfSeries:
             if not text.startswith(HEAD_OF_FILE) or any(
                 s[0] != self._describe(k, float(s[1]), int(s[2])) for k, s in enumerate(kept)
             ):
-                raise CheckpointError(f"{other}: expected the fields {self._names} on {self._size}; {remedy}")
+                names = ", ".join(u.name for u, _, _ in self._fields)
+                whole = f"{self._cells.numbering.total} cells and {self._nodes.numbering.total} nodes"
+                raise CheckpointError(f"{other}: expected the fields {names} on {whole}; {remedy}")
             size = self._numbers.stat().st_size
             if size < self._start(len(kept)):
                 raise CheckpointError(
@@ -251,14 +253,6 @@ class XdmfSeries:
         if self._more:
             self._text.replace_end(self._end, TAIL.encode())
             self._bin.truncate(self._start(self.n_steps))
-
-    @property
-    def _names(self) -> str:
-        return ", ".join(u.name for u, _, _ in self._fields)
-
-    @property
-    def _size(self) -> str:
-        return f"{self._cells.numbering.total} cells and {self._nodes.numbering.total} nodes"
 
     def write(self, time: float, step: int) -> None:
         """Append the present values (collective).
