@@ -54,9 +54,6 @@ class Condensed(Returning):
     """The factorisation of one K without the components of the contact, and the last constrained problem that uses it.
 
     Not for mixed problems: with those components fixed, an incompressible body may be enclosed, and its matrix singular.
-
-    Args:
-        space: the space that K acts on.
     """
 
     def __init__(self, space: Nodes):

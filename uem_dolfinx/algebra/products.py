@@ -60,7 +60,6 @@ class UnitedMatrix(Returning):
     """``Q'(K + G)P`` for successive K, in the same matrix as long as its sparsity is unchanged.
 
     Args:
-        space: the space that K acts on.
         reserving: whether the sparsity includes inactive equations.
     """
 

@@ -251,9 +251,6 @@ class SharpEdges:
     """Sharp convex edges within a surface of 3D bodies, in straight pieces between neighbouring nodes (collective).
 
     Each edge occurs twice, once for each of its facets.
-
-    Args:
-        facets: of the surface.
     """
 
     def __init__(self, facets: TargetFacets):

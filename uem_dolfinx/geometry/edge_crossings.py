@@ -58,7 +58,6 @@ class SharpLines:
     """Sharp convex edges of a surface of 3D bodies, in pieces between neighbouring nodes of lines, on one rank each (collective).
 
     Args:
-        facets: of the surface.
         of: those of which every edge has one at least ``(m,)``; None: all.
 
     Attributes:

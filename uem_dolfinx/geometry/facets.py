@@ -40,7 +40,6 @@ class TargetFacets:
     """Facets of a surface on this rank, oriented outwards (collective).
 
     Args:
-        tag: of the surface.
         role: of the surface, for messages.
 
     Raises:

@@ -24,9 +24,6 @@ class JoinedFacets(TargetFacets):
     """Facets of several surfaces, one surface after the other on each rank (collective).
 
     A facet of two surfaces occurs twice. Normals at nodes are averages over facets of one surface.
-
-    Args:
-        surfaces: the S joined surfaces.
     """
 
     def __init__(self, config: Configuration, surfaces: Sequence[TargetFacets]):

@@ -29,12 +29,7 @@ from uem_dolfinx.parallel import gathered
 
 
 class PartSolver(UnitedSolver):
-    """Solver of ``Q'(K + G)P`` by a factorisation of a few unknowns; methods are those of ``UnitedSolver``.
-
-    Args:
-        space: the space that K acts on.
-        prefix: of PETSc's options.
-    """
+    """Solver of ``Q'(K + G)P`` by a factorisation of a few unknowns; methods are those of ``UnitedSolver``."""
 
     cheap = True
     tells_sign = False
