@@ -335,7 +335,9 @@ def plot_pressure(
         InputError, InputTypeError: for an object that is no contact, or a function that does not return one number per point.
         UserFunctionError: if a function raises.
     """
-    pairs: list[Contact] = given.items("contacts", [contacts] if _is_contact(contacts) else contacts, _is_contact, "a contact")
+    kinds = Contact | ManyContacts
+    listed = [contacts] if isinstance(contacts, kinds) else contacts
+    pairs: list[Contact] = given.items("contacts", listed, lambda one: isinstance(one, kinds), "a contact")
     if not pairs:
         raise InputError(given.sentence("contacts", contacts, "a contact or several"))
     with agreed(pairs[0].config.comm):
@@ -365,10 +367,6 @@ def plot_pressure(
             ax.grid(alpha=0.25)
             ax.legend(frameon=False)
     return Picture(file.getvalue()) if picture is ... else None
-
-
-def _is_contact(one: Any) -> bool:
-    return isinstance(one, (Contact, ManyContacts))
 
 
 def _curve(what: str, f: Callable[[Array], Any], at: Array, n: int) -> Array:

@@ -55,7 +55,6 @@ class Results:
         self.names: tuple[str, ...] = tuple(self._steps[0]) if steps else ()
         self.mesh, self._made = mesh, mesh is None
         if grid is not None:
-            on_rank_0(comm, f"the results {stem} cannot be read", lambda: _need(self._numbers))
             if mesh is None:
                 self.mesh = self._make_mesh(comm, *grid)
             else:
@@ -155,11 +154,6 @@ class Item:
         self.kind = {"Little": "<", "Big": ">"}[element.get("Endian")] + {"Int": "i8", "Float": "f8"}[element.get("NumberType")]
 
 
-def _need(path: Path) -> None:
-    if not path.exists():
-        raise MissingFileError(f"{path} does not exist: expected it next to its .xdmf file, which describes it")
-
-
 def _described(path: Path) -> tuple[list[tuple[float, int, dict[str, Item]]], tuple[str, Item, Item] | None]:
     """Times, numbers and fields of the steps of an XDMF file, and the type, cells and nodes of its mesh."""
     steps, grid = [], None
@@ -171,6 +165,8 @@ def _described(path: Path) -> tuple[list[tuple[float, int, dict[str, Item]]], tu
         fields = {one.get("Name"): Item(one[0], one.get("Center") == "Node") for one in found.iter("Attribute")}
         steps.append((float(time), int(number), fields))  # type: ignore[arg-type]
         grid = topology.get("TopologyType"), Item(topology[0]), Item(geometry[0])  # type: ignore[union-attr,index]
+    if grid is not None and not (numbers := path.with_suffix(".bin")).exists():
+        raise MissingFileError(f"{numbers} does not exist: expected it next to its .xdmf file, which describes it")
     return steps, grid  # type: ignore[return-value]
 
 
