@@ -74,8 +74,9 @@ class Restriction:
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift, error = self._eliminate() if like is None else self._eliminate_like(like)
-        told = np.array([equations.active.sum(), len(equations), error is not None], dtype=np.int64)
-        self.n_equations, self._n_rows, wrong = (int(k) for k in reduced(self.comm, told))
+        terms = equations.active[equations.row].sum()
+        told = np.array([equations.active.sum(), len(equations), terms, error is not None], dtype=np.int64)
+        self.n_equations, self._n_rows, self._n_terms, wrong = (int(k) for k in reduced(self.comm, told))
         if wrong:
             agree(self.comm, error)
         self.used: Bools = free.copy()  # columns of P that are in use ``(n_owned, block)``
@@ -83,8 +84,8 @@ class Restriction:
         self.rings: Rings | None = None
         self._hold(equations, prescribed)
         #: The number of powers of M in the series of P and c, and whether equations follow each other in rings that decay.
-        self.chain, self.fades = 1 if self.n_equations else 0, False
-        if self.n_equations and stacked:
+        self.chain, self.fades = 1 if self._n_terms else 0, False
+        if self._n_terms and stacked:
             self.chain, parts = self._longest_chain()
             if parts is not None:
                 self.chain = _fading(parts)
@@ -101,7 +102,7 @@ class Restriction:
         #: Active equations, whose terms form M, and the nodes that they follow.
         self._held = equations.select(equations.active)
         self._follows, self._term = np.unique(self._held.followed, return_inverse=True)
-        self._halo = Halo(self.space, self._follows) if self._n_rows else None
+        self._halo = Halo(self.space, self._follows) if self._n_terms else None
 
     def with_gaps(self, equations: UnitingEquations, free: Bools, prescribed: Array, stacked: bool) -> Restriction | None:
         """The same P with other increments c; None if more than gaps and prescribed increments differs on any rank (collective)."""
@@ -312,6 +313,8 @@ class Restriction:
     def pass_on(self, F: PETSc.Vec) -> PETSc.Vec:
         """Transfer the contactors' forces to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F`` (collective)."""
         part = F.array_r.reshape(-1, self.space.block)
+        if not self.chain:
+            return self.space.vector(part)
         total, eq = part.copy(), self._held
         for _ in range(self.chain):
             along = np.einsum("mg,mg->m", self.lift[self.equations.active], part[eq.node])
@@ -344,7 +347,9 @@ class Restriction:
         return self._series(v)
 
     def _series(self, v: PETSc.Vec) -> PETSc.Vec:
-        """``(1 + M + M^2 + ...) v`` (collective)."""
+        """``(1 + M + M^2 + ...) v``, or v itself where no equation follows a node (collective)."""
+        if not self.chain:
+            return v
         part = v.array_r.reshape(-1, self.space.block)
         total, eq, lift = part.copy(), self._held, self.lift[self.equations.active]
         for _ in range(self.chain):

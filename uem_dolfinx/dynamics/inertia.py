@@ -16,7 +16,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from uem_dolfinx import compat, forms, given
+from uem_dolfinx import compat, given
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.contact.contact import Contact
@@ -56,6 +56,7 @@ class Dynamics(given.Sealed):
         acceleration: a Function; zero at components without mass, at prescribed ones the mean over the last step.
         mean_velocity: a Function, increments of the last step over its length; at the start the velocity.
         driven: kinetic energy added by prescribed motion (this rank).
+        struck: work of contact and equations on masses in explicit steps with massy contactors (this rank).
         time: of the committed state.
         start: time at the start.
         accelerated: whether the acceleration is consistent with the forces.
@@ -100,7 +101,7 @@ class Dynamics(given.Sealed):
         self.start_velocity, self.gravity = velocity, gravity
         self.resumed, self.accelerated, self.moving, self._attached = 0, False, False, False
         #: Length of the last committed step, zero before the first, and the factor of M in the tangent.
-        self.last = self.factor = self.driven = self.dt = 0.0
+        self.last = self.factor = self.driven = self.struck = self.dt = 0.0
         self.added: list[AddedMass] = []  #: Masses at points of rigid couplings.
         self.damping_form: ufl.Form | None = None  #: Virtual work of the damping forces.
 
@@ -130,7 +131,7 @@ class Dynamics(given.Sealed):
         self.mean_velocity = fem.Function(config.V, name="mean_velocity")
         self._set_velocity()
         self.mean_velocity.x.array[:] = self.velocity.x.array
-        self.held = np.zeros(self._n, dtype=bool)
+        self.hold(np.zeros(self._n, dtype=bool))
         with agreed(config.comm):
             self._down = np.zeros(g) if self.gravity is None else given.vector("gravity", self.gravity, g)
             if config.axisymmetric and self._down[0] != 0.0:
@@ -182,6 +183,7 @@ class Dynamics(given.Sealed):
     def hold(self, held: Bools) -> None:
         """Set the mask of prescribed owned components ``(n_owned, gdim)``, whose velocities follow the prescribed motion."""
         self.held = held.ravel()
+        self._at_held = np.flatnonzero(self.held)
 
     def make_contactors_massless(self, contacts: Sequence[Contact]) -> None:
         """Redistribute the mass of contact surfaces by ``massless.without_surfaces``, unless they keep it (collective).
@@ -194,9 +196,7 @@ class Dynamics(given.Sealed):
         if self.contactors == "massless":
             self.mass = without_surfaces(self.mass, contacts)
         self.massy = self.mass.of_nodes > 0
-        self._weight = forms.product(
-            self.mass.M, self.mass.config.vector(np.broadcast_to(self._down, (self.config.n_owned, self.config.gdim)))
-        )
+        self._weight = self.mass.times(np.tile(self._down, self.config.n_owned))
 
     def add(self, one: AddedMass) -> None:
         """Add a mass at a point that moves with the nodes of its coupling (collective)."""
@@ -231,10 +231,10 @@ class Dynamics(given.Sealed):
         signs differ. This is of second order for smooth motions, and equal to w after a jump, which is then an impact within the step.
         Accelerations are differences of v, extrapolated to the time of the equation of motion.
         """
-        i, dt, last = self.held, self.dt, self.last
-        v, before = self._velocity[: self._n][i], self._acceleration[: self._n][i]
-        w = (self._displacement - self._u)[: self._n][i] / dt
-        slope = 2.0 * (w - self.mean_velocity.x.array[: self._n][i]) / (dt + last)
+        i, dt, last = self._at_held, self.dt, self.last
+        v, before = self._velocity[i], self._acceleration[i]
+        w = (self._displacement[i] - self._u[i]) / dt
+        slope = 2.0 * (w - self.mean_velocity.x.array[i]) / (dt + last)
         slope = np.where(slope * before > 0.0, np.where(np.abs(slope) < np.abs(before), slope, before), 0.0)
         end = w + 0.5 * dt * slope
         mean = (end - v) / dt
@@ -245,7 +245,7 @@ class Dynamics(given.Sealed):
         """Update the velocity of prescribed components in the damping form to the present displacement (collective)."""
         if self.damping is None or not self.moving:
             return
-        i = np.flatnonzero(self.held)
+        i = self._at_held
         self.past.x.array[i] = self._prescribed()[0] - self._v_rate * self._displacement[i]
         self.past.x.scatter_forward()
 
@@ -282,9 +282,10 @@ class Dynamics(given.Sealed):
         n, du = self._n, (self._displacement - self._u)[: self._n]
         jump = self._a_rate * du + (self._a_past - self._acceleration)[:n]
         speed = self._v_rate * du + self._v_past[:n]
-        jump[self.held] = 0.0
-        error, v = (self.mass.config.vector(part) for part in ((self.scheme.beta - 1 / 6) * self.dt * jump, speed))
-        return tuple(float(np.sqrt(max(part.dot(forms.product(self.mass.M, part)), 0.0))) for part in (error, v))  # type: ignore[return-value]
+        jump[self._at_held] = 0.0
+        parts = (self.scheme.beta - 1 / 6) * self.dt * jump, speed
+        error, v = reduced(self.config.comm, np.array([(part * self.mass.times(part)).sum() for part in parts]))
+        return float(np.sqrt(max(error, 0.0))), float(np.sqrt(max(v, 0.0)))
 
     @contextmanager
     def without_inertia(self, damping: float = 0.0) -> Iterator[None]:
@@ -301,14 +302,12 @@ class Dynamics(given.Sealed):
                 self._rate.value = rate
 
     @timed("inertia forces")
-    def load(self) -> PETSc.Vec:
-        """Inertia forces, which explicit steps find from the others, minus weight, to be added to the residual (collective)."""
-        load = -self._weight
-        if not (self.moving and isinstance(self.scheme, CentralDifferences)):
-            load.axpy(1.0, self._inertia() if self.moving else self.mass.config.vector(self.forces.x.array[: self._n]))
-        if self.added:
-            load.array[:] += self.added_forces()
-        return load
+    def load(self) -> Array | None:
+        """Inertia forces, which explicit steps find from others, minus weight, to add to residuals ``(n,)``; None for zero (collective)."""
+        if self.moving and self.scheme.explicit:
+            return -self._weight if self._down.any() else None
+        load = (self._inertia() if self.moving else self.forces.x.array[: self._n]) - self._weight
+        return load + self.added_forces() if self.added else load
 
     def added_forces(self, carried: bool = False) -> Array:
         """Nodal inertia forces minus weight of masses at points, present or as last committed (``carried``) ``(n,)`` (collective)."""
@@ -317,17 +316,14 @@ class Dynamics(given.Sealed):
             forces[one.set.nodes] += one.nodal_forces(one.carried if carried else one.loads())
         return forces.ravel()
 
-    def _inertia(self, prescribed: tuple[Array, Array, Array] | None = None) -> PETSc.Vec:
-        """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1."""
+    def _inertia(self, prescribed: tuple[Array, Array, Array] | None = None) -> Array:
+        """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1 ``(n,)``."""
         s, n = self.scheme, self._n
         du = self._displacement - self._u
         a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
-        a[:n][self.held] = (prescribed or self._prescribed())[2]
-        inertia = forms.product(self.mass.M, self.mass.config.vector(a[:n]))
-        if s.alpha_f:
-            inertia.axpy(-s.alpha_f, self.mass.config.vector(self.forces.x.array[:n]))
-        inertia.scale(1.0 / (1.0 - s.alpha_f))
-        return inertia
+        a[self._at_held] = (prescribed or self._prescribed())[2]
+        inertia = self.mass.times(a[:n])
+        return (inertia - s.alpha_f * self.forces.x.array[:n]) / (1.0 - s.alpha_f) if s.alpha_f else inertia
 
     def accelerate(self, restriction: Restriction, F: PETSc.Vec, added: PETSc.Mat | None = None) -> None:
         """Initial acceleration with constraints P under F, the static residual minus weight: ``P'MP a = -P'F`` (collective).
@@ -346,15 +342,13 @@ class Dynamics(given.Sealed):
         for one in self.added:
             one.accelerate(a.array_r[: self._n].reshape(-1, self.config.gdim))
         self._acceleration = np.array(self.acceleration.x.array)
-        self.forces.x.array[: self._n] = forms.product(
-            self.mass.M, self.mass.config.vector(self._acceleration[: self._n])
-        ).array_r
+        self.forces.x.array[: self._n] = self.mass.times(self._acceleration[: self._n])
         self.forces.x.scatter_forward()
         self.accelerated = True
 
     def rates(self, prescribed: tuple[Array, Array, Array] | None = None) -> tuple[Array, Array]:
         """Velocity and acceleration at the end of the present step, at the present displacement, ``(n,)`` each."""
-        n, held, massy = self._n, self.held, self.massy.ravel()
+        n, held, massy = self._n, self._at_held, self.massy.ravel()
         end, mean, _ = prescribed or self._prescribed()
         du = (self._displacement - self._u)[:n]
         a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
@@ -365,13 +359,12 @@ class Dynamics(given.Sealed):
     def commit(self) -> None:
         """Commit velocity and acceleration at the present displacement."""
         if self.moving:
-            n, dt, held = self._n, self.dt, self.held
-            self.forces.x.array[:n] = self._inertia(known := self._prescribed()).array_r
+            n, dt, i = self._n, self.dt, self._at_held
+            self.forces.x.array[:n] = self._inertia(known := self._prescribed())
             self.velocity.x.array[:n], self.acceleration.x.array[:n] = self.rates(known)
             self.mean_velocity.x.array[:n] = (self._displacement - self._u)[:n] / dt
             change = self.velocity.x.array[:n] - self._velocity[:n]
-            work = forms.product(self.mass.M, self.mass.config.vector(change)).array_r * (self._velocity[:n] + 0.5 * change)
-            self.driven += float(work[held].sum())
+            self.driven += float((self.mass.times(change)[i] * (self._velocity[i] + 0.5 * change[i])).sum())
             for field in (self.forces, self.acceleration, self.velocity, self.mean_velocity):
                 field.x.scatter_forward()
             self.time, self.last, self.moving = self._until, dt, False
@@ -379,8 +372,12 @@ class Dynamics(given.Sealed):
             one.commit()
         self._copy_committed()
 
-    def end_with(self, velocity: Array, acceleration: Array) -> None:
-        """Set velocity and acceleration of free components at the end of the present explicit step, before its ``commit`` ``(n,)``."""
+    def end_with(self, velocity: Array, acceleration: Array, struck: float = 0.0) -> None:
+        """Set velocity and acceleration of free components at the end of the present explicit step, before its ``commit`` ``(n,)``.
+
+        ``struck`` is the work of contact and equations on masses in this step.
+        """
+        self.struck += struck
         self._v_rate, self._v_past[: self._n], self._a_past[: self._n] = 0.0, velocity, acceleration
 
     def change_rates(self, velocity: Array, acceleration: Array, part: float = 1.0) -> None:
@@ -392,7 +389,7 @@ class Dynamics(given.Sealed):
         change = np.where(free, acceleration - self.acceleration.x.array[:n], 0.0)
         self.velocity.x.array[:n] = np.where(free, velocity, self.velocity.x.array[:n])
         self.acceleration.x.array[:n] += change
-        self.forces.x.array[:n] += forms.product(self.mass.M, self.mass.config.vector(change)).array_r / part
+        self.forces.x.array[:n] += self.mass.times(change) / part
         for field in (self.forces, self.acceleration, self.velocity):
             field.x.scatter_forward()
         self._copy_committed()
@@ -425,17 +422,19 @@ class Dynamics(given.Sealed):
         """Acceleration of free fall ``(gdim,)``."""
         return self._down
 
-    def weight(self) -> PETSc.Vec:
-        """Forces of gravity on the mass of the nodes."""
+    def weight(self) -> Array:
+        """Forces of gravity on the mass of the nodes ``(n,)``."""
         return self._weight.copy()
 
     def momentum(self) -> Array:
         """Momentum ``(gdim,)``; in axisymmetry only along the axis (collective)."""
-        p = forms.product(self.mass.M, self.mass.config.vector(self.velocity.x.array[: self._n]))
-        sums = reduced(self.config.comm, p.array_r.reshape(-1, self.config.gdim).sum(axis=0))
+        p = self.mass.times(self.velocity.x.array[: self._n].reshape(-1, self.config.gdim))
+        sums = reduced(self.config.comm, p.sum(axis=0))
         return self.config.of_circles(sums + sum(one.momentum for one in self.added))
 
     def kinetic_energy(self) -> float:
         """``v'Mv / 2``, plus the kinetic energy of masses at points (collective)."""
-        v = self.mass.config.vector(self.velocity.x.array[: self._n])
-        return 0.5 * float(v.dot(forms.product(self.mass.M, v))) + sum(one.kinetic_energy for one in self.added)
+        v = self.velocity.x.array[: self._n]
+        return 0.5 * float(reduced(self.config.comm, (v * self.mass.times(v)).sum())) + sum(
+            one.kinetic_energy for one in self.added
+        )

@@ -325,7 +325,9 @@ class Mass:
         return np.asarray(reduced(self.config.comm, np.array(sums)))
 
     def times(self, field: Array) -> Array:
-        """M times a field at the owned nodes ``(n_owned, gdim)`` (collective)."""
+        """M times a field at the owned nodes, of any shape ``(n_owned, gdim)`` or ``(n_owned * gdim,)`` (collective)."""
+        if self.diagonal:
+            return np.asarray(self.of_nodes.reshape(field.shape) * field)
         x, y = self.M.createVecs()
         x.array[:] = field.ravel()
         self.M.mult(x, y)

@@ -126,10 +126,12 @@ class RateSlopes:
     def _densities(self, start: bool) -> tuple[Array, Array]:
         """What is proportional to the density in the inertia forces, at the start or the end of a step, and weight (collective)."""
         d, alpha = self._dynamics, self._dynamics.scheme.alpha_f
-        weight, before = d.weight().array_r, d.forces.x.array[: self._n]
+        weight, before = d.weight(), d.forces.x.array[: self._n]
         if start:
             return d.mass.times(d.acceleration.x.array[: self._n].reshape(-1, d.config.gdim)).ravel(), weight
-        return d.load().array_r + weight + alpha / (1.0 - alpha) * before, weight
+        load = d.load()
+        assert load is not None
+        return load + weight + alpha / (1.0 - alpha) * before, weight
 
 
 class RateChanges(RateSlopes):

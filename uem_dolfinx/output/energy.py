@@ -59,7 +59,8 @@ class EnergyBook(Closing, given.Sealed):
 
     Columns: the fields of ``Energies``, the momentum ``momentum_x`` ..., and for every contact the impulse ``impulse_x`` ... on the
     contactor's body. Works are integrated by the trapezoidal rule. In explicit steps with massy contactors, contact acts on masses for
-    the whole step: rows at both ends of a step give its exact impulse, and ``contact`` the energy lost in plastic impacts of these masses.
+    the whole step: ``contact`` adds up its work in every step, also between rows, the energy lost in plastic impacts of these masses, and
+    rows at both ends of a step give its exact impulse.
 
     Args:
         problem: with ``dynamics``.
@@ -118,8 +119,8 @@ class EnergyBook(Closing, given.Sealed):
                 "%s ends at time %.6g and is gone on with at %.6g: the work in between is missing; write a row after every step",
                 path, begin["time"], self.dynamics.time,
             )  # fmt: skip
-        #: Whether contact strikes masses at the beginning of explicit steps.
-        self._struck = is_explicit(self.dynamics) and self.dynamics.contactors == "massy"
+        #: Whether contact strikes masses for whole explicit steps.
+        self._strikes = is_explicit(self.dynamics) and self.dynamics.contactors == "massy"
         whole = [] if problem.impacts is None else problem.impacts.pairs
         #: Contacts whose forces act for whole implicit steps ``(n_contacts,)``.
         self._lasting = np.array([any(c.pair.whole is pair for pair in whole) for c in self._contacts], dtype=bool)
@@ -137,7 +138,7 @@ class EnergyBook(Closing, given.Sealed):
         """Read the forces and the displacement of this instant (collective)."""
         problem, n = self.problem, self.problem.config.n_owned * self.problem.config.gdim
         u = np.array(problem.config.displacement[: problem.config.n_owned].ravel())
-        self._u, self._time, self._driven = u, self.dynamics.time, self.dynamics.driven
+        self._u, self._time, self._driven, self._struck = u, self.dynamics.time, self.dynamics.driven, self.dynamics.struck
         #: Number of steps up to this instant, and the mean velocity of the last one ``(n,)``.
         self._steps, self._rate = problem.step_control.number, np.array(self.dynamics.mean_velocity.x.array[:n])
         forces = np.array([c.force.x.array[:n] for c in self._contacts]).reshape(-1, n)
@@ -151,7 +152,7 @@ class EnergyBook(Closing, given.Sealed):
         fluid = sum((pair.on_nodes().ravel() for pair in leaking), np.zeros(n))
         held = ~problem.bodies.free[: problem.config.n_owned].ravel()
         reaction = (known[:n] - contact - linear - fluid) * held
-        outer = reaction + fluid + self.dynamics.weight().array_r + self._assembled(self._external)
+        outer = reaction + fluid + self.dynamics.weight() + self._assembled(self._external)
         if problem.bodies.tangent.points is not None:
             outer += problem.bodies.tangent.points.loads().ravel()
         if added := self.dynamics.added:
@@ -159,6 +160,8 @@ class EnergyBook(Closing, given.Sealed):
             outer -= self.dynamics.added_forces(carried=True)
         #: Forces from outside on these masses, and their displacements.
         self._at_points = [(one.pushed, one.places) for one in added]
+        # what strikes masses works as much as ``struck``: the rest is that of supports, which reactions balance
+        contact = held * (contact + linear) if self._strikes else contact
         #: Forces of damping, from outside, of contact, and of equations, from outside as well, then of contact that acts for whole steps,
         #: and of the supports that it presses ``(6, n)``.
         self._forces = np.stack([self._assembled(self._damping), outer, contact, linear + np.zeros(n), lasting, held * -lasting])
@@ -189,15 +192,19 @@ class EnergyBook(Closing, given.Sealed):
         Returns:
             The new row.
         """
-        u, forces, resultants, time, driven = self._u, self._forces, self._resultants, self._time, self._driven
+        u, forces, resultants, time, driven, struck = (
+            self._u, self._forces, self._resultants, self._time, self._driven, self._struck,
+        )  # fmt: skip
         before, rate, steps = self._at_points, self._rate, self.problem.step_control.number - self._steps
         self._read_forces()
         # NumPy's sums do not depend on where arrays lie in memory, those of BLAS do
         works, impulse = 0.5 * ((forces + self._forces) * (self._u - u)).sum(axis=1), 0.5 * (resultants + self._resultants)
-        if self._struck and steps == 1:
-            # the forces act between the mean velocities of two steps
-            works[2:] = 0.5 * self.dynamics.dt * (self._forces[2:] * (rate + self._rate)).sum(axis=1)
-            impulse = self._resultants
+        if self._strikes:
+            if steps == 1:
+                # the forces act between the mean velocities of two steps
+                works[3] = 0.5 * self.dynamics.dt * (self._forces[3] * (rate + self._rate)).sum()
+                impulse = self._resultants
+            works[2] += self._struck - struck - works[3]
         elif steps == 1:
             works[4:] = (self._forces[4:] * (self._u - u)).sum(axis=1)
             impulse[self._lasting] = self._resultants[self._lasting]

@@ -17,7 +17,7 @@ import ufl
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, in_rows, product, rows_at, to_owners, together
+from uem_dolfinx.algebra.blocks import Blocks, blocks_of_matrix, product, rows_at, summed, to_owners, together
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.products import made_of
 from uem_dolfinx.algebra.restriction import Restriction
@@ -83,17 +83,15 @@ class PartSolver(UnitedSolver):
         found, place = np.unique(A.column, return_inverse=True)
         columns = space.ask_owners(found, numbers)[place, 0]
         diagonal = np.where(self._used[self._at], 0.0, idle).reshape(-1, g, 1) * np.eye(g)
-        i = np.concatenate([numbers[A.row - space.first, 0] - first, np.arange(len(nodes))])
-        j, value = np.concatenate([columns, first + np.arange(len(nodes))]), np.concatenate([A.value, diagonal])
-        matrix = PETSc.Mat().createAIJ(
-            ((g * len(nodes), None), (g * len(nodes), None)), csr=_lines(i, j, value, len(nodes), size), comm=space.comm
-        )
+        own, here = Blocks(numbers[A.row - space.first, 0] - first, columns, A.value), np.arange(len(nodes))
+        lines = _lines(together(own, Blocks(here, first + here, diagonal)), len(nodes))
+        matrix = PETSc.Mat().createAIJ(((g * len(nodes), None), (g * len(nodes), None)), csr=lines, comm=space.comm)
         self._rhs, self._dq = matrix.createVecs()
         self._pc = factorised(matrix, symmetric)
 
-    def _uncoupled(self, rhs: PETSc.Vec) -> Array:
-        """Solution at all unknowns that are not coupled ``(n,)``, zero where idle."""
-        return np.zeros(self._used.size)
+    def _uncoupled(self, rhs: PETSc.Vec) -> Array | None:
+        """Solution at all unknowns that are not coupled ``(n,)``, zero where idle; None if all are zero."""
+        return None
 
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and 1 for the number of linear iterations; LinearSolveError if the matrix is singular (collective)."""
@@ -129,14 +127,16 @@ def factorised(A: PETSc.Mat, symmetric: bool) -> PETSc.PC:
     return pc
 
 
-def _lines(row: Ints, column: Ints, value: Array, n: int, size: int) -> tuple[Array, Array, Array]:
-    """Compressed lines of n rows of blocks, from the local row and the column of each block ``(k, g, g)``; repeated ones add."""
-    from scipy.sparse import bsr_matrix
-
-    g = value.shape[1]
-    A = bsr_matrix(in_rows(row, column, value, n), shape=(g * n, g * size)).tocsr()
-    A.sum_duplicates()
-    return A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data
+def _lines(A: Blocks, n: int) -> tuple[Array, Array, Array]:
+    """Compressed lines of n rows of blocks, from the local row and the column of each block; repeated ones add."""
+    A, g = summed(A), A.value.shape[1]
+    counts, k = np.bincount(A.row, minlength=n), np.arange(g)
+    first = (np.cumsum(counts) - counts)[A.row]
+    # the entries of a block lie in g lines
+    place = g * (g * first + np.arange(len(first)) - first)[:, None, None] + (g * counts[A.row])[:, None, None] * k[:, None] + k
+    columns, values = np.empty(place.size, PETSc.IntType), np.empty(place.size)
+    columns[place], values[place] = g * A.column[:, None, None] + k, A.value
+    return np.append(0, np.repeat(g * counts, g).cumsum()).astype(PETSc.IntType), columns, values
 
 
 class MassSolver(PartSolver):
@@ -249,10 +249,11 @@ class Prediction:
         bodies.u.x.array[:] = u
         bodies.u.x.scatter_forward()
         fine, before = self._assemble(), np.inf
+        enough = problem.rtol * bodies.residual.norm()
         for _ in range(MOST_SURFACE_SOLVES):
             F = self._Q.transpose(system.residual())
             norm = F.norm()
-            if not fine or norm >= before or norm <= problem.rtol * bodies.residual.norm():
+            if not fine or norm >= before or norm <= enough:
                 break
             dq, _ = self._solver.solve(-F)
             du, before = self._P.expand(dq), norm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
@@ -149,8 +149,8 @@ class Bodies:
                 self.tangent.points.add_forces(self._b.array)
             if self.dead is not None:
                 self._b.array[:] -= self.dead[: self._n_owned]
-            if self.dynamics is not None:
-                self.config.add_to(self._b.array, self.dynamics.load().array_r)
+            if self.dynamics is not None and (load := self.dynamics.load()) is not None:
+                self.config.add_to(self._b.array, load)
         return bool(np.isfinite(self._b.norm()))
 
     @property
@@ -217,7 +217,7 @@ class Bodies:
             return 0.0
         rounded = np.abs(self.config.displacement[: self.config.n_owned])
         if self.config.moves:
-            np.add.at(rounded, positioned, np.abs(self.config.x[positioned]))
+            np.add.at(rounded, positioned, np.abs(self.config.here(positioned)))
         of_displacement = float(FORCE_ROUNDING * self.config.vector(rounded * self.stiffness).norm())
         if self._added:
             of_points = FORCE_ROUNDING * np.linalg.norm([one.rounding() for one in self._added])
@@ -234,7 +234,7 @@ class Bodies:
         """Forces due to rounding of the positions of owned nodes ``(n,)``, at these nodes ``(n,)``."""
         if self.stiffness is None:
             return np.zeros(len(nodes))
-        forces = np.abs(self.config.x[nodes]) * np.abs(self.stiffness[nodes])
+        forces = np.abs(self.config.here(nodes)) * np.abs(self.stiffness[nodes])
         return np.asarray(FORCE_ROUNDING * forces.max(axis=1, initial=0.0))
 
     def above_rounding(self, positioned: bool) -> Any:
@@ -246,10 +246,11 @@ class Bodies:
             return self.unknowns.norms(self.residual)
         F, n = self.forces, self.config.n_owned
         body, count = self._linked or find_bodies(self.config)
-        rounded = largest_of_groups(body[:n], np.abs(self.config.displacement[:n]).max(axis=1, initial=0.0), count)
+        moved = np.abs(self.config.displacement[:n])
+        rounded = largest_of_groups(body[:n], moved.max(axis=1, initial=0.0) if count > 1 else moved, count)
         self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
-        own = rounded[body[:n]] + (self.config.size if positioned else 0.0)
-        limit = ABOVE_ROUNDING * FORCE_ROUNDING * np.abs(self.stiffness) * own[:, None]
+        own = rounded[body[:n], None] if count > 1 else rounded
+        limit = ABOVE_ROUNDING * FORCE_ROUNDING * (own + (self.config.size if positioned else 0.0)) * np.abs(self.stiffness)
         told = float(self.config.vector(np.where(np.abs(F) > limit, F, 0.0)).norm())
         if self._fields is None:
             return self._beside(told, [one.size() for one in self._added])
@@ -310,14 +311,18 @@ class Bodies:
             self.held = before
             self._take_held()
 
+    @cached_property
+    def _sent(self) -> fem.Function:
+        """Buffer for values that owners send."""
+        return fem.Function(self.u.function_space)
+
     def of_owners(self, values: AnyArray) -> AnyArray:
         """Values of all unknowns ``(n,)`` with ghosts copied from their owners, of the same type (collective)."""
         if self.comm.size == 1:
             return values
-        f = fem.Function(self.u.function_space)
-        f.x.array[:] = values
-        f.x.scatter_forward()
-        return np.array(f.x.array).astype(values.dtype)
+        self._sent.x.array[:] = values
+        self._sent.x.scatter_forward()
+        return np.array(self._sent.x.array).astype(values.dtype)
 
     @property
     def prescribed(self) -> Array:

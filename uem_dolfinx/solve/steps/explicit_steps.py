@@ -142,10 +142,12 @@ class StepperWithMass(ExplicitStepper):
             raise
         a = self._accelerations()
         self._refuse_cells(dt, a, ())
-        half, kick = (problem.u.x.array[:n] - begin) / dt, 0.5 * dt * a
+        # forces of contact act for the whole step, between the mean velocities of two steps
+        ends, kick = (problem.u.x.array[:n] - begin) / dt, 0.5 * dt * a
+        struck = 0.5 * float((self._mass * (ends - half) * (mean + ends))[self.moving].sum())
         # contact takes part in the change of the velocity, and the next step starts with the velocity in its middle all the same
         taken = self._along_contact(kick) if history[-1].active or problem.linear is not None else kick
-        dynamics.end_with(half + taken, a + (kick - taken) * 2.0 / dt)
+        dynamics.end_with(ends + taken, a + (kick - taken) * 2.0 / dt, struck)
         problem.commit()
         return history
 
