@@ -154,3 +154,19 @@ def test_products_that_are_no_polynomials():
     exact = (np.outer(w, w).ravel() * 0.25 * J) @ tab.N
     assert np.abs(found - exact).max() < 1e-11
     assert len(s.weight) <= 4 * 49
+
+
+@pytest.mark.parametrize("bend", [1e-3, 0.1])
+def test_quadratic_sides_are_integrated_to_rounding(bend):
+    """Products of shape functions of both sides, whose middles are off theirs a little or far, as by a fine rule of the same segment."""
+    shape, found = facet_shape("interval", 2), []
+    x, y = np.column_stack([shape.nodes, np.zeros(3)]), np.column_stack([shape.nodes * 1.3 - 0.7, np.full(3, 0.1)])
+    x[2, 0] += bend
+    y[2] -= bend * np.array([1.0, 0.5])
+    s = overlap(Planes.of(shape, x[None], np.array([-1.0])), (shape, x[None]), (shape, y[None]), np.array([-1.0]), ONE)
+    gauss, w = np.polynomial.legendre.leggauss(40)
+    at = 0.6 * (gauss + 1) / 2
+    xi, eta = (locate(shape, np.tile(nodes[:, :1], (40, 1, 1)), at[:, None]) for nodes in (x, y))
+    for weight, here, there in ((s.weight, s.xi, s.eta), (0.3 * w, xi, eta)):
+        found.append(np.einsum("q,qa,qb->ab", weight, shape.functions(here), shape.functions(there)))
+    assert np.abs(found[0] - found[1]).max() <= 1e-9 * bend

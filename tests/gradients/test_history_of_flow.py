@@ -17,6 +17,7 @@ from uem_dolfinx import compat
 from uem_dolfinx.materials.back_stress import kinematic_return
 from uem_dolfinx.materials.finite_plasticity import VARYING
 from uem_dolfinx.materials.hardening import Linear, Saturating
+from uem_dolfinx.materials.layers import BackTable, Layers
 from uem_dolfinx.materials.logarithmic import logarithmic_return, to_components, to_tensors
 from uem_dolfinx.materials.return_mapping import plane_stress_return, radial_return
 from uem_dolfinx.materials.return_slopes import kinematic_back, logarithmic_back, plane_stress_back, radial_back
@@ -31,6 +32,7 @@ SCENES = [
     slow({"kind": "plane_stress", "moves": 10.0}),
     slow({"moves": 10.0, "friction": 0.2}),
     slow({"moves": BACK_STRESSES}),
+    slow({"moves": BACK_STRESSES, "kind": "plane_stress"}),
     slow({"law_of": uem.FinitePlasticity, "moves": 0.0}),
     slow({"law_of": uem.FinitePlasticity, "moves": 10.0, "cell": "hexahedron", "kind": "3d", "friction": 0.2}),
     slow({"law_of": uem.FinitePlasticity, "moves": BACK_STRESSES}),
@@ -196,13 +198,61 @@ def test_slopes_of_the_return_in_finite_strain(kind, curve, moves):
         assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(told, rel=1e-6, abs=1e-6 * np.abs(told).max()), i
 
 
+@pytest.mark.parametrize("nu", [0.3, 0.45])
+def test_slopes_of_layers_in_plane_stress(nu):
+    """By strain, history, E, nu and the yield stress, where some layers flow, against central differences."""
+    rng, n, table = np.random.default_rng(3), 40, BackTable.read(BACK_STRESSES)
+    j = len(table.strains)
+    plastic, deviatoric = rng.normal(size=(2, n * j, 4)) * 5e-4
+    for values in (plastic, deviatoric):
+        values[:, :3] -= values[:, :3].mean(axis=1, keepdims=True)
+    begin = [rng.normal(size=(n, 3)) * 4e-3, plastic, rng.random(n * j) * 0.01, 200.0 * (1.0 + rng.random(n)), np.full(n, nu)]
+    begin.append(np.full(n, 0.4))
+    counts = rng.normal(size=(n, 3)), rng.normal(size=(n * j, 4)), rng.normal(size=n * j)
+
+    def layers(values):
+        E, nu, flow = values[3:]
+        return Layers.of(table, flow, E / (2 * (1 + nu)))
+
+    def counted(values):
+        found = layers(values).plane_stress_return(*values[:5])
+        of_layers = (found.plastic_strain * counts[1]).sum(axis=1) + found.peeq * counts[2]
+        return (found.stress * counts[0]).sum(axis=1) + of_layers.reshape(n, j).sum(axis=1)
+
+    flows = layers(begin).plane_stress_return(*begin[:5]).peeq > begin[2]
+    assert 0.1 < flows.mean() < 0.9
+    by = layers(begin).plane_stress_back(*begin[:5], *counts)
+    E = begin[3]
+    found = (
+        by.strain,
+        by.plastic_strain,
+        by.peeq,
+        (by.shear + by.area) / E,
+        by.area / (1 - nu) - by.shear / (1 + nu),
+        by.yield_stress,
+    )
+    sizes = rng.normal(size=(n, 3)) * 1e-3, deviatoric, 0.01 * np.ones(n * j), 0.1 * E, 0.1 * begin[4], 0.1 * begin[5]
+    for i, change in enumerate(sizes):
+        ends = [counted([*begin[:i], begin[i] + h * change, *begin[i + 1 :]]) for h in (-1e-5, 1e-5)]
+        slope = (found[i] * change).reshape(n, -1).sum(axis=1)
+        assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(slope, rel=1e-6, abs=1e-6 * np.abs(slope).max()), i
+
+
+class OfUsers(uem.VonMises):
+    """A law without derivatives through its history."""
+
+    @property
+    def slopes(self):
+        raise AttributeError
+
+
 def test_what_is_refused():
     """Laws whose memory has no derivatives, and single states of those that have."""
     s = bent()
     v = ufl.TestFunction(s.V)
-    law = uem.VonMises(s.u, 200.0, 0.3, 0.4, kinematic_hardening=BACK_STRESSES, kind="plane_stress")
+    law = OfUsers(s.u, 200.0, 0.3, 0.4, kind="plane_stress")
     problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
-    refused(uem.InputError, "no table of back stresses in plane stress", uem.recording(problem).__enter__)
+    refused(uem.InputError, "expected VonMises or FinitePlasticity", uem.recording(problem).__enter__)
     law = uem.VonMises(s.u, s.E, 0.3, 0.4, kind="plane_strain")
     problem = uem.UnitedProblem(law.residual(v), s.u, materials=[law])
     refused(uem.InputError, "take the steps within uem.recording(problem)", lambda: uem.gradient(problem, s.u[0] * ufl.dx, s.E))

@@ -188,6 +188,7 @@ DRAGGED += [
     ("triangle", None, "neo", ("friction", "E", "top"), {"ring": True}),
     ("triangle", None, "neo", ("friction", "E", "top"), {"coupling": "mortar", "ring": True}),
     ("triangle", "sphere", "neo", ("friction", "X", "place"), {"coupling": "mortar", "degree": 2}),
+    ("triangle", None, "neo", ("friction", "X", "E", "top", "full"), {"coupling": "mortar", "degree": 2}),
 ]
 
 

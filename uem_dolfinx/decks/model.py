@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 from uem_dolfinx.arrays import Array
 from uem_dolfinx.decks.by_sets import Closing, local_axes, node_of, nodes_of
@@ -36,6 +36,8 @@ OUTPUT = (
 OTHERWISE = r"\d[RI]|C3D20|C(PS|PE|AX)8"
 #: Names of Abaqus for degrees of freedom that are held, from the first to the last.
 NAMED_HOLDS = {"ENCASTRE": ("1", "6"), "PINNED": ("1", "3"), "XSYMM": ("1", "1"), "YSYMM": ("2", "2"), "ZSYMM": ("3", "3")}
+#: Keywords of a material with one number.
+NUMBERS = {"DENSITY": "density", "EXPANSION": "expansion", "CONDUCTIVITY": "conductivity", "SPECIFIC HEAT": "heat_capacity"}
 #: Options that are taken, or that change nothing here; all others are left out.
 KNOWN_OPTIONS = {
     "ELASTIC": "TYPE", "EXPANSION": "TYPE ZERO", "SOLID SECTION": "ELSET MATERIAL ORIENTATION OFFSET", "MATERIAL": "NAME",
@@ -50,35 +52,26 @@ KNOWN_OPTIONS = {
     "COUPLED TEMPERATURE-DISPLACEMENT": "SOLVER DIRECT STEADY_STATE",
 }  # fmt: skip
 
+Options: TypeAlias = dict[str, str]
+Rows: TypeAlias = list[list[str]]
+
 
 class _Reader:
-    """Reads keywords one after the other; materials, interactions and steps collect what follows them."""
+    """Reads keywords one after the other, ``*NAME`` by ``read_name``; materials, interactions and steps collect what follows them."""
 
     def __init__(self, deck: Deck):
         self.model, self._deck = Model(types=deck.types), deck
         self._material, self._interaction, self._begin = Material(), Interaction(), Step()
         self._amplitudes: dict[str, Course] = {}
-        self._axes: dict[int, Array] = {}  # local directions of nodes
+        self.axes: dict[int, Array] = {}  # local directions of nodes
         self._changed = ""  # the interaction whose friction a step changes
         self._perturbs = False
         self._step, self._dim = self._begin, 3 if any(name.startswith("C3D") for name in deck.types) else 2
         #: Kinds of conditions of this step, and what they have set.
         self._met, self._own = set[str](), set[tuple[str, Any, Any]]()
-        self._sets: dict[tuple[str, int], None] = {}
-        self._readers: dict[str, Callable[[dict[str, str], list[list[str]]], bool | None]] = {
-            "MATERIAL": self._of_material, "ELASTIC": self._elastic, "DENSITY": self._number("density"),
-            "EXPANSION": self._number("expansion"), "CONDUCTIVITY": self._number("conductivity"),
-            "SPECIFIC HEAT": self._number("heat_capacity"), "SOLID SECTION": self._section,
-            "DAMPING": self._damping,
-            "SURFACE INTERACTION": self._of_interaction, "SURFACE BEHAVIOR": self._behaviour, "FRICTION": self._friction,
-            "GAP CONDUCTANCE": self._conductance, "CONTACT PAIR": self._pair, "TIE": self._tie, "EQUATION": self._equation,
-            "PRE-TENSION SECTION": self._pretension, "INITIAL CONDITIONS": self._initial, "STEP": self._new_step,
-            "BOUNDARY": self._boundary, "CLOAD": self._cload, "DLOAD": self._dload, "DSLOAD": self._dload,
-            "TEMPERATURE": self._temperature, "MODEL CHANGE": self._change, "CHANGE FRICTION": self._change_friction,
-            "AMPLITUDE": self._amplitude, "RIGID BODY": self._rigid, "TRANSFORM": self._transform,
-        }  # fmt: skip
+        self.sets: dict[tuple[str, int], None] = {}
 
-    def take(self, keyword: str, options: dict[str, str], rows: list[list[str]]) -> bool:
+    def take(self, keyword: str, options: Options, rows: Rows) -> bool:
         """Store the data of a keyword; whether it has a counterpart here."""
         if keyword == "FREQUENCY":
             # about the state of a static step, which changes nothing
@@ -97,33 +90,30 @@ class _Reader:
                 raise InputError("EXPLICIT: expected implicit steps of time")
             self.model.steps.append(self._step)
             return True
-        reader = self._readers.get(keyword)
+        if keyword in ("ELASTIC", *NUMBERS) and not (kind := options.get("TYPE", "ISO").upper()).startswith("ISO"):
+            raise InputError(f"TYPE={kind}: expected ISO, an isotropic material")
+        if keyword in NUMBERS:
+            setattr(self._material, NUMBERS[keyword], _numbers(rows[0])[0])
+            return len(rows) == 1
+        # *DSLOAD is read as *DLOAD
+        name = keyword.replace("DSLOAD", "DLOAD").replace(" ", "_").replace("-", "_").lower()
+        reader: Callable[[Options, Rows], bool | None] | None = getattr(self, f"read_{name}", None)
         return reader is not None and reader(options, rows) is not False
 
     # -- materials and interactions --------------------------------------------------------------------------------------
 
-    def _of_material(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_material(self, options: Options, rows: Rows) -> None:
         name = options["NAME"].upper()
         self._material = self.model.materials.setdefault(name, Material(name))
 
-    def _elastic(self, options: dict[str, str], rows: list[list[str]]) -> bool:
-        _isotropic(options)
-        E, nu = _numbers(rows[0])[:2]
-        self._material.elastic = E, nu
+    def read_elastic(self, options: Options, rows: Rows) -> bool:
+        self._material.elastic = _numbers(rows[0])[0], _numbers(rows[0])[1]
         return len(rows) == 1
 
-    def _number(self, what: str) -> Callable[[dict[str, str], list[list[str]]], bool]:
-        def read(options: dict[str, str], rows: list[list[str]]) -> bool:
-            _isotropic(options)
-            setattr(self._material, what, _numbers(rows[0])[0])
-            return len(rows) == 1
-
-        return read
-
-    def _damping(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_damping(self, options: Options, rows: Rows) -> None:
         self._material.damping = float(options.get("ALPHA", 0.0)), float(options.get("BETA", 0.0))
 
-    def _section(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_solid_section(self, options: Options, rows: Rows) -> None:
         plane = any(name.startswith(("CPS", "CPE")) for name in self.model.types)
         t = (plane and rows and _numbers(rows[0])[0]) or 1.0
         if self.model.sections and t != self.model.thickness:
@@ -131,14 +121,14 @@ class _Reader:
         self.model.thickness = t
         self.model.sections.append((options["ELSET"].upper(), options["MATERIAL"].upper()))
 
-    def _of_interaction(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_surface_interaction(self, options: Options, rows: Rows) -> None:
         self._interaction = self.model.interactions.setdefault(options["NAME"].upper(), Interaction())
 
-    def _behaviour(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_surface_behavior(self, options: Options, rows: Rows) -> None:
         self._interaction.overclosure = options.get("PRESSURE-OVERCLOSURE", "HARD").upper()
         self._interaction.numbers = [_numbers(row) for row in rows]
 
-    def _friction(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_friction(self, options: Options, rows: Rows) -> None:
         mu = _numbers(rows[0])[0]
         if self._step is self._begin:
             self._interaction.friction = mu
@@ -147,18 +137,18 @@ class _Reader:
         else:
             self._step.friction[self._changed] = mu
 
-    def _change_friction(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_change_friction(self, options: Options, rows: Rows) -> None:
         self._changed = options["INTERACTION"].upper()
         if self._changed not in self.model.interactions:
             raise InputError(f"there is no interaction '{self._changed}': expected one of {', '.join(self.model.interactions)}")
 
-    def _conductance(self, options: dict[str, str], rows: list[list[str]]) -> bool:
+    def read_gap_conductance(self, options: Options, rows: Rows) -> bool:
         self._interaction.conductance = [_numbers(row) for row in rows]
         return len(rows) == 1
 
     # -- the model -------------------------------------------------------------------------------------------------------
 
-    def _pair(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_contact_pair(self, options: Options, rows: Rows) -> None:
         adjust: Any = options.get("ADJUST") or None
         if adjust is not None and adjust[0] not in ".0123456789":
             self.model.left_out.append(f"ADJUST={adjust} of *CONTACT PAIR: all contactors near the surface are adjusted")
@@ -171,14 +161,14 @@ class _Reader:
                 )
             )  # fmt: skip
 
-    def _tie(self, options: dict[str, str], rows: list[list[str]]) -> bool:
+    def read_tie(self, options: Options, rows: Rows) -> bool:
         if "CYCLIC SYMMETRY" in options or "MULTISTAGE" in options:
             return False
         reach = options.get("POSITION TOLERANCE")
         self.model.pairs += [Pair(row[0], row[1], adjust=float(reach) if reach else None, tied=True) for row in rows]
         return True
 
-    def _equation(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_equation(self, options: Options, rows: Rows) -> None:
         left = [value for row in rows for value in row if value]
         while left:
             n, left = int(left[0]), left[1:]
@@ -188,31 +178,31 @@ class _Reader:
             self.model.equations.append(Linear([(node_of(self._deck, node), (int(dof), float(c))) for node, dof, c in terms]))
             left = left[3 * n :]
 
-    def _pretension(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_pre_tension_section(self, options: Options, rows: Rows) -> None:
         self.model.pretension.append((options["SURFACE"], options["NODE"], _numbers(rows[0])[:3] if rows else []))
 
-    def _initial(self, options: dict[str, str], rows: list[list[str]]) -> bool:
+    def read_initial_conditions(self, options: Options, rows: Rows) -> bool:
         if (kind := options["TYPE"].upper()) == "VELOCITY":
             self.model.velocities |= {(node_of(self._deck, row[0]), int(row[1])): _numbers(row[2:])[0] for row in rows}
         elif kind == "TEMPERATURE":
             _last(self.model.initial, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
         return kind in ("VELOCITY", "TEMPERATURE")
 
-    def _rigid(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_rigid_body(self, options: Options, rows: Rows) -> None:
         at = int(options["REF NODE"])
         # without a node of its own, degrees of freedom 4 to 6 are rotations
         self.model.rigid.append(
             (options.get("NSET") or options["ELSET"], self._deck.nodes[at], at, int(options.get("ROT NODE", "0")))
         )
 
-    def _transform(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_transform(self, options: Options, rows: Rows) -> None:
         kind, numbers = options.get("TYPE", "R").upper(), [float(value) for row in rows for value in row if value]
         if kind not in ("R", "C") or len(numbers) != 6:
             raise InputError(f"TYPE={kind} with {len(numbers)} numbers: expected R or C, with two points")
         for one in nodes_of(self._deck, options["NSET"]):
-            self._axes[one] = local_axes(kind, numbers, self._deck.nodes[one])
+            self.axes[one] = local_axes(kind, numbers, self._deck.nodes[one])
 
-    def _amplitude(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_amplitude(self, options: Options, rows: Rows) -> None:
         numbers = [float(value.lower().replace("d", "e")) for row in rows for value in row if value]
         points = tuple(zip(numbers[::2], numbers[1::2]))
         times = [time for time, _ in points]
@@ -223,7 +213,7 @@ class _Reader:
         total = options.get("TIME", "").upper().startswith("TOTAL")
         self._amplitudes[options["NAME"].upper()] = Course(1.0, points, total)
 
-    def _value(self, text: str, options: dict[str, str]) -> Value:
+    def _value(self, text: str, options: Options) -> Value:
         """A number of a row, which follows the amplitude in the options, if there is one."""
         value, name = _numbers([text])[0], options.get("AMPLITUDE", "").upper()
         if not name:
@@ -234,7 +224,7 @@ class _Reader:
 
     # -- steps -----------------------------------------------------------------------------------------------------------
 
-    def _new_step(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_step(self, options: Options, rows: Rows) -> None:
         last = self.model.steps[-1] if self.model.steps else self._begin
         self._met, self._own, self._changed, self._perturbs = set(), set(), "", "PERTURBATION" in options
         self._step = Step(
@@ -243,7 +233,7 @@ class _Reader:
             temperatures=dict(last.temperatures),
         )  # fmt: skip
 
-    def _begins(self, kind: str, options: dict[str, str], *acting: dict[Any, Any]) -> None:
+    def _begins(self, kind: str, options: Options, *acting: dict[Any, Any]) -> None:
         """Let the first keyword of a kind in a step end what acted before, with ``OP=NEW``."""
         for one in acting if options.get("OP", "MOD").upper() == "NEW" and kind not in self._met else ():
             one.clear()
@@ -266,7 +256,7 @@ class _Reader:
             self.model.left_out.append(f"degree of freedom {dof} of *{keyword}: the bodies have none such")
         return False
 
-    def _boundary(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_boundary(self, options: Options, rows: Rows) -> None:
         if "FIXED" in options:
             raise InputError("FIXED holds displacements that steps before have reached: expected values")
         self._begins("BOUNDARY", options, self._step.held)
@@ -275,17 +265,17 @@ class _Reader:
             first, last = NAMED_HOLDS.get(first.upper(), (first, last))
             for dof in range(int(first), int(last or first) + 1):
                 if self._has(where, dof, _numbers([value])[0], "BOUNDARY"):
-                    self._sets[where, dof] = None
+                    self.sets[where, dof] = None
                     self._step.held |= {(one, dof): self._value(value, options) for one in nodes_of(self._deck, where)}
 
-    def _cload(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_cload(self, options: Options, rows: Rows) -> None:
         self._begins("CLOAD", options, self._step.forces)
         for where, dof, value in (row[:3] for row in rows):
             if self._has(where, int(dof), _numbers([value])[0], "CLOAD"):
                 for one in nodes_of(self._deck, where):
                     self._add("CLOAD", self._step.forces, (one, int(dof)), self._value(value, options))
 
-    def _dload(self, options: dict[str, str], rows: list[list[str]]) -> bool:
+    def read_dload(self, options: Options, rows: Rows) -> bool:
         self._begins("DLOAD", options, self._step.pressures, self._step.bodies)
         of_bodies = [row for row in rows if row[1].upper() in ("GRAV", "CENTRIF")]
         for elements, label, value, *numbers in of_bodies:
@@ -304,19 +294,15 @@ class _Reader:
                     self._add("DLOAD", self._step.pressures, (str(one), side.upper()), self._value(value, options))
         return len(pressing) + len(of_bodies) == len(rows)
 
-    def _temperature(self, options: dict[str, str], rows: list[list[str]]) -> None:
+    def read_temperature(self, options: Options, rows: Rows) -> None:
         self._begins("TEMPERATURE", options, self._step.temperatures)
         _last(self._step.temperatures, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
 
-    def _change(self, options: dict[str, str], rows: list[list[str]]) -> bool:
+    def read_model_change(self, options: Options, rows: Rows) -> bool:
         if options.get("TYPE", "").upper() != "CONTACT PAIR":
             return False
         self._step.contacts |= {(row[0].upper(), row[1].upper()): "ADD" in options for row in rows}
         return True
-
-    def closing(self) -> Closing:
-        """What is left to be done after all keywords."""
-        return Closing(self._deck, self.model, self._sets, self._axes)
 
 
 def _kept(acting: Acting, last: Step) -> Acting:
@@ -330,12 +316,6 @@ def _last(values: dict[str, float], more: dict[str, float]) -> None:
     for name, value in more.items():
         values.pop(name, None)
         values[name] = value
-
-
-def _isotropic(options: dict[str, str]) -> None:
-    """InputError for another type than that of an isotropic material."""
-    if not (kind := options.get("TYPE", "ISO").upper()).startswith("ISO"):
-        raise InputError(f"TYPE={kind}: expected ISO, an isotropic material")
 
 
 def model_of(deck: Deck) -> Model:
@@ -363,7 +343,7 @@ def model_of(deck: Deck) -> Model:
         left_out.append(f"thickness {reader.model.thickness}: forces of contacts and sections are those of a thickness of 1")
     if not reader.model.steps:
         raise InputError(f"the deck has no step that can be taken: expected *STEP with one of {', '.join(STEP_KINDS)}, FREQUENCY")
-    reader.closing().close()
+    Closing(deck, reader.model, reader.sets, reader.axes).close()
     left_out[:] = dict.fromkeys(left_out)
     return reader.model
 

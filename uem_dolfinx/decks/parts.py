@@ -86,12 +86,11 @@ class BodyLoad:
 
     def acceleration(self, x: Any) -> Any:
         """At positions x, an expression, for a value of 1, which about an axis is the square of a speed."""
-        g, direction = len(x), ufl.as_vector(self.numbers[-3:])
-        if self.label == "GRAV":
-            return ufl.as_vector([direction[c] for c in range(g)])
-        away = ufl.as_vector([(x[c] if c < g else 0.0) - self.numbers[c] for c in range(3)])
-        away = away - ufl.dot(away, direction) * direction
-        return ufl.as_vector([away[c] for c in range(g)])
+        g, along = len(x), ufl.as_vector(self.numbers[-3:])
+        if self.label == "CENTRIF":
+            arm = ufl.as_vector([(x[c] if c < g else 0.0) - self.numbers[c] for c in range(3)])
+            along = arm - ufl.dot(arm, along) * along
+        return ufl.as_vector([along[c] for c in range(g)])
 
 
 @dataclass
@@ -152,13 +151,7 @@ class Linear:
 
 @dataclass
 class Step:
-    """A step: its kind, times, and all conditions and loads that act in it, with their values at its end.
-
-    Attributes:
-        alpha: of the Hilber-Hughes-Taylor method, in ``*DYNAMIC``.
-        friction: coefficients that change, by the names of interactions.
-        motions: values of ``held`` and ``forces`` at reference nodes of rigid bodies, by these words, node and degree of freedom.
-    """
+    """A step: its kind, times, and all conditions and loads that act in it, with their values at its end."""
 
     kind: str = "STATIC"
     nlgeom: bool = False
@@ -166,14 +159,15 @@ class Step:
     duration: float = 1.0
     steady: bool = False
     direct: bool = False
-    alpha: float = -0.05
+    alpha: float = -0.05  # of the Hilber-Hughes-Taylor method, in ``*DYNAMIC``
     held: dict[Where, Value] = field(default_factory=dict)
     forces: dict[Where, Value] = field(default_factory=dict)
     pressures: dict[Where, Value] = field(default_factory=dict)
     bodies: dict[tuple[str, BodyLoad], Value] = field(default_factory=dict)
     temperatures: dict[str, float] = field(default_factory=dict)
     contacts: dict[tuple[str, str], bool] = field(default_factory=dict)
-    friction: dict[str, float] = field(default_factory=dict)
+    friction: dict[str, float] = field(default_factory=dict)  # coefficients that change, by the names of interactions
+    # values of ``held`` and ``forces`` at reference nodes of rigid bodies, by these words, node and degree of freedom
     motions: dict[tuple[str, int, int], Value] = field(default_factory=dict)
 
     def times(self) -> Iterator[tuple[float, float]]:

@@ -134,19 +134,13 @@ def _keywords(path: Path, around: tuple[Path, ...] = ()) -> Iterator[tuple[str, 
         keyword, rows = parts[0][0].strip().upper(), []
         options = {name.strip().upper(): value.strip().strip('"') for name, _, value in parts[1:]}
         if keyword == "INCLUDE":
-            included, around_it = _beside(path, options.get("INPUT", "")), (*around, path.resolve())
+            included, around_it = path.parent / options.get("INPUT", ""), (*around, path.resolve())
+            if not included.is_file():
+                raise MeshError(f"{path} includes '{options.get('INPUT', '')}', which is not in its folder")
             if included.resolve() in around_it:
                 raise MeshError(f"{path} includes '{included.name}', which it is included by: leave that line out")
             yield from _keywords(included, around_it)
     yield keyword, options, rows
-
-
-def _beside(path: Path, name: str) -> Path:
-    """Path of an included file."""
-    found = path.parent / name
-    if not found.is_file():
-        raise MeshError(f"{path} includes '{name}', which is not in its folder")
-    return found
 
 
 def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str]]) -> None:

@@ -39,7 +39,7 @@ def recording(
 
     Args:
         problem: in statics or in time; supported are Coulomb friction with sliding='finite', at degree 2 in 2D and with mortar only, and
-            ``VonMises`` or ``FinitePlasticity`` as law with history, but no table of back stresses in plane stress.
+            ``VonMises`` or ``FinitePlasticity`` as law with history.
         scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
         controls: of the derivatives that are wanted later, if known: those without derivatives are refused before the first step.
 
@@ -74,10 +74,10 @@ def recording(
             _check_first(problem, "steps in time")
         for material in problem.materials:
             _check_first(problem, "those of a law with history")
-            if not getattr(material, "has_slopes", False):
+            if not hasattr(material, "slopes"):
                 raise InputError(
                     f"a history has no derivatives through what {type(material).__name__} remembers: expected VonMises "
-                    "or FinitePlasticity, with no table of back stresses in plane stress; else take differences of runs"
+                    "or FinitePlasticity; else take differences of runs"
                 )
         try:
             history = History(problem, None if scratch is None else Path(scratch))

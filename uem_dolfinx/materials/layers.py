@@ -6,14 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uem_dolfinx import given
-from uem_dolfinx.arrays import Array, Ints
+from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import InputError
 from uem_dolfinx.materials.hardening import Linear, read_pairs
 from uem_dolfinx.materials.logarithmic import Flowed, logarithmic_return
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 #: Slopes of a table that differ by less than this part are one straight line.
 #: [convention; slope; test_tabulated_back_stress.py::test_points_on_a_straight_line]
 SAME_SLOPE = 1e-9
+#: Components in the plane, of those in plane strain. [format; components; -]
+PLANE = [0, 1, 3]
 
 
 @dataclass(frozen=True)
@@ -149,8 +151,6 @@ class Layers:
     def plane_stress_return(self, strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array) -> Returned:
         """Return of all layers with the same out-of-plane strain, for which the body's out-of-plane stress is zero.
 
-        This stress increases with the strain: Newton's method, safeguarded by lower and upper bounds of the strain.
-
         Args:
             strain: in the plane ``(n, 3)``.
             plastic_strain: committed, of layers, with the out-of-plane component, as in plane strain ``(n j, 4)``.
@@ -162,7 +162,25 @@ class Layers:
             Stress of the body in the plane, NaN without convergence; history of layers; j + 1 vectors m.
         """
         mu, bulk = E / (2 * (1 + nu)), E / (3 * (1 - 2 * nu))
-        full, plane, one = np.insert(strain, 2, 0.0, axis=1), [0, 1, 3], np.array([1.0, 1.0, 0.0])
+        full, each, stiff, converged = self._free_across(strain, plastic_strain, peeq, mu, bulk)
+        pressure, c, m = bulk * full[:, :3].sum(axis=1), each.c + bulk, each.m.reshape(len(full), self.count, 4)
+        one = np.array([1.0, 1.0, 0.0])
+        stress = each.stress[:, PLANE] + pressure[:, None] * one
+        stress[~converged] = np.nan
+        # condensation of the out-of-plane strain: derivative of the stress in the plane by it
+        mixed = c[:, None] * one - np.einsum("nj,njk->nk", m[:, :, 2], m[:, :, PLANE])
+        last = mixed / np.sqrt(stiff)[:, None]
+        vectors = np.concatenate([m[:, :, PLANE].reshape(len(full), 3 * self.count), last], axis=1)
+        return Returned(stress, each.plastic_strain, each.peeq, each.a, c, vectors, each.energy + pressure**2 / (2 * bulk))
+
+    def _free_across(
+        self, strain: Array, plastic_strain: Array, peeq: Array, mu: Array, bulk: Array
+    ) -> tuple[Array, Returned, Array, Bools]:
+        """Strains ``(n, 4)`` without stress out of the plane, their return, that stress's slope ``(n,)``, and which are found ``(n,)``.
+
+        The stress increases with the strain: Newton's method, safeguarded by lower and upper bounds of the strain.
+        """
+        full = np.insert(strain, 2, 0.0, axis=1)
         low, high = np.full(len(strain), -np.inf), np.full(len(strain), np.inf)
         # initial guess: elastic step
         step = 2 * mu * self.mean(plastic_strain)[:, 2] - (bulk - 2 / 3 * mu) * strain[:, :2].sum(axis=1)
@@ -170,20 +188,32 @@ class Layers:
         for _ in range(MAX_STEPS):
             full[:, 2] += step
             each = self.radial_return(full, plastic_strain, peeq, mu)
-            pressure, c, m = bulk * full[:, :3].sum(axis=1), each.c + bulk, each.m.reshape(len(full), self.count, 4)
-            stiff = each.a + c - (m[:, :, 2] ** 2).sum(axis=1)
+            stiff = each.a + each.c + bulk - (each.m.reshape(len(full), self.count, 4)[:, :, 2] ** 2).sum(axis=1)
             converged = np.abs(step) <= RETURNED * np.linalg.norm(full, axis=1)
             if converged.all():
                 break
-            across, now = each.stress[:, 2] + pressure, full[:, 2]
+            across, now = each.stress[:, 2] + bulk * full[:, :3].sum(axis=1), full[:, 2]
             low, high = np.where(across < 0, now, low), np.where(across > 0, now, high)
             step = -across / stiff
             i = np.flatnonzero((now + step < low) | (now + step > high))
             step[i] = (low[i] + high[i]) / 2 - now[i]
-        stress = each.stress[:, plane] + pressure[:, None] * one
-        stress[~converged] = np.nan
-        # condensation of the out-of-plane strain: derivative of the stress in the plane by it
-        mixed = c[:, None] * one - np.einsum("nj,njk->nk", m[:, :, 2], m[:, :, plane])
-        last = mixed / np.sqrt(stiff)[:, None]
-        vectors = np.concatenate([m[:, :, plane].reshape(len(full), 3 * self.count), last], axis=1)
-        return Returned(stress, each.plastic_strain, each.peeq, each.a, c, vectors, each.energy + pressure**2 / (2 * bulk))
+        return full, each, stiff, converged
+
+    def plane_stress_back(
+        self, strain: Array, plastic_strain: Array, peeq: Array, E: Array, nu: Array, by_stress: Array, *by_history: Array
+    ) -> ByReturn:
+        """Derivatives of ``plane_stress_return``, whose arguments come first: those of ``radial_return`` at the strain that it finds.
+
+        The stress across, which vanishes, has the multiplier that makes the derivative by the strain across zero.
+        """
+        mu, bulk = E / (2 * (1 + nu)), E / (3 * (1 - 2 * nu))
+        full, _, stiff, _ = self._free_across(strain, plastic_strain, peeq, mu, bulk)
+        of_deviator, of_pressure = np.insert(by_stress, 2, 0.0, axis=1), by_stress[:, :2].sum(axis=1)
+        back = partial(self.radial_back, full, plastic_strain, peeq, mu)
+        of_deviator[:, 2] = -(back(of_deviator, *by_history).strain[:, 2] + bulk * of_pressure) / stiff
+        by, pressed = back(of_deviator, *by_history), bulk * (of_pressure + of_deviator[:, 2])
+        by.strain[:, :2] += pressed[:, None]
+        # the bulk modulus is 2 area shear / 3 (3 shear - area)
+        of_bulk, area, shear = pressed * full[:, :3].sum(axis=1), E / (1 - nu), E / (1 + nu)
+        part = of_bulk / (3 * shear - area)
+        return replace(by, strain=by.strain[:, PLANE], shear=by.shear - area * part, area=3 * shear * part)

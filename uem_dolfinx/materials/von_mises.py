@@ -343,11 +343,6 @@ class VonMises(given.Sealed):
         """Weighted mean over the layers of each point; values ``(n, ...)`` are unchanged without layers."""
         return values if self._layers is None else self._layers.mean(values)
 
-    @property
-    def has_slopes(self) -> bool:
-        """Whether gradients through histories are available: not with a table of back stresses in plane stress."""
-        return self._layers is None or self.kind != "plane_stress"
-
     def begins_with(self) -> tuple[Any, ...]:
         """Initial values of the return at the present displacement: strain, committed history and parameters, in its order."""
         elastic = [self._E, self._nu] if self.kind == "plane_stress" else [self._mu]
@@ -370,8 +365,10 @@ class VonMises(given.Sealed):
         """Strain along a displacement, and derivatives of the return."""
         from uem_dolfinx.materials.return_slopes import plane_stress_back, radial_back
 
-        radial: Callable[..., ByReturn] = radial_back if self._layers is None else self._layers.radial_back
-        return lambda w: self._vector(self._variation(w)), plane_stress_back if self.kind == "plane_stress" else radial
+        plane, of = self.kind == "plane_stress", self._layers
+        radial: Callable[..., ByReturn] = radial_back if of is None else of.radial_back
+        flat: Callable[..., ByReturn] = plane_stress_back if of is None else of.plane_stress_back
+        return lambda w: self._vector(self._variation(w)), flat if plane else radial
 
     def _refuse_infinite(self, stress: Array) -> None:
         """NotFiniteError on all ranks if a stress at this rank's points ``(n_points, size)`` is not finite (collective)."""
