@@ -383,17 +383,18 @@ def product(A: PETSc.Mat, x: PETSc.Vec, G: PETSc.Mat | None = None) -> PETSc.Vec
     return y
 
 
-def solve_mass(M: PETSc.Mat, rhs: PETSc.Vec, nothing: float, rtol: float) -> tuple[PETSc.Vec, int]:
+def solve_mass(M: PETSc.Mat, rhs: PETSc.Vec, nothing: float, rtol: float, symmetric: bool = True) -> tuple[PETSc.Vec, int]:
     """``M^-1 rhs`` of a mass matrix by CG, zero where its diagonal is at most this part of the largest entry (collective).
 
-    Rows without mass become rows of the identity. Returns the solution, and KSP's reason to stop, negative without convergence.
+    Rows without mass become rows of the identity; GMRES solves for what is not ``symmetric``. Returns the solution, and KSP's reason to
+    stop, negative without convergence.
     """
     diagonal = M.getDiagonal()
     massless = diagonal.array_r <= nothing * diagonal.max()[1]
     diagonal.array[massless], rhs.array[massless] = 1.0, 0.0
     M.setDiagonal(diagonal)
     ksp = PETSc.KSP().create(M.comm)
-    ksp.setType("cg")
+    ksp.setType("cg" if symmetric else "gmres")
     ksp.getPC().setType("jacobi")
     ksp.setTolerances(rtol=rtol, max_it=10_000)
     ksp.setOperators(M)

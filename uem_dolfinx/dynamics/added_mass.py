@@ -145,10 +145,10 @@ class AddedMass:
 
     def start(self, velocity: Array, gravity: Array) -> None:
         """Set the initial velocity from the nodes' velocities ``(n_owned, gdim)``, and gravity ``(gdim,)`` (collective)."""
-        self.velocity = self._carried(velocity)
+        self.velocity = self.carried_by(velocity)
         self._weight[0] = self.masses[0] * gravity
 
-    def _carried(self, rates: Array) -> Array:
+    def carried_by(self, rates: Array) -> Array:
         """Rates of point and axes ``(1 + n_axes, gdim)``, from rates of the nodes ``(n_owned, gdim)`` (collective)."""
         at = self._placement
         return self.motions(at) @ self.set.motion_of(at, rates)
@@ -164,7 +164,7 @@ class AddedMass:
 
     def accelerate(self, acceleration: Array) -> None:
         """Set the first acceleration from the acceleration of the nodes ``(n_owned, gdim)`` (collective)."""
-        self.acceleration = self._carried(acceleration)
+        self.acceleration = self.carried_by(acceleration)
         self.forces = self.masses[:, None] * self.acceleration
 
     def take_out(self, acceleration: Array, part: float) -> Array:
@@ -172,7 +172,7 @@ class AddedMass:
 
         Returns those inertia forces at the owned nodes of the set ``(n, gdim)``.
         """
-        inertia = self.masses[:, None] * (a := self._carried(acceleration))
+        inertia = self.masses[:, None] * (a := self.carried_by(acceleration))
         self.acceleration, self.forces = self.acceleration - part * a, self.forces - inertia
         return self.nodal_forces(inertia)
 

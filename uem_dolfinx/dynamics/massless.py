@@ -135,27 +135,33 @@ ACCELERATED = 1e-13
 
 
 def united_accelerations(
-    mass: PETSc.Mat, restriction: Restriction, forces: PETSc.Vec, added: PETSc.Mat | None = None
+    mass: PETSc.Mat, restriction: Restriction, forces: PETSc.Vec, added: PETSc.Mat | None = None, test: Restriction | None = None
 ) -> PETSc.Vec:
-    """``P a`` with ``P'MP a = P' forces``, zero in components without mass (collective).
+    """``P a`` with ``Q'MP a = Q' forces``, zero in components without mass (collective).
 
     Args:
         mass: M, with the rows and columns of the constrained system.
         restriction: P.
         forces: on all unknowns.
         added: masses at points, in addition to M.
+        test: Q; by default P.
 
     Raises:
         LinearSolveError: if masses are negative.
     """
-    M = mass.copy() if restriction.alone else mass.PtAP(restriction.P)
+    test = test or restriction
+
+    def united(A: PETSc.Mat) -> PETSc.Mat:
+        return A.PtAP(restriction.P) if test is restriction else test.P.transposeMatMult(A.matMult(restriction.P))
+
+    M = mass.copy() if restriction.alone else united(mass)
     if restriction.alone:
         restriction.cross_out(M)
     if added is not None:
-        M.axpy(1.0, added.PtAP(restriction.P), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-    rhs = restriction.transpose(forces)
+        M.axpy(1.0, united(added), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    rhs = test.transpose(forces)
     with timed("first acceleration"):
-        q, reason = forms.solve_mass(M, rhs, MASSLESS, ACCELERATED)
+        q, reason = forms.solve_mass(M, rhs, MASSLESS, ACCELERATED, test is restriction)
     if reason < 0:
         raise LinearSolveError(f"the first acceleration was not found (KSP reason {reason}): check that no mass is negative")
     return restriction.expand(q)

@@ -207,6 +207,7 @@ class EnergyBook(Closing, given.Sealed):
             works[2] += self._struck - struck - works[3]
         elif steps == 1:
             works[4:] = (self._forces[4:] * (self._u - u)).sum(axis=1)
+            works[1:3] += 0.0 if self.problem.impacts is None else self.problem.impacts.excess
             impulse[self._lasting] = self._resultants[self._lasting]
         works[1:3] += self._driven - driven + works[3] + works[5], works[4]
         self._works += reduced(self.problem.comm, works[:3])

@@ -163,6 +163,12 @@ class Rows:
         """Whether some of the equations depend on others."""
         return self.independent is not None and self.independent.found
 
+    def with_gaps(self, over_constraints: OverConstraints, gap: Array, active: Bools) -> Rows:
+        """The same equations with other gaps ``(m,)``, of which others are ``active (m,)``, and nothing prescribed (collective)."""
+        whole, free = replace(self.whole, rows=replace(self.whole.rows, gap=gap, active=active)), self.test.free
+        independent, Q, straight = _restricted(over_constraints, self.pairs, self.equations, whole, free, np.zeros(free.shape))
+        return replace(self, whole=whole, independent=independent, test=Q, frictionless=straight)
+
     def settle(
         self, bodies: Bodies, solver: UnitedSolver, F: PETSc.Vec, G: PETSc.Mat | None, du: Array, left: float
     ) -> Solved | None:
@@ -258,7 +264,20 @@ def make_rows(
     whole = ContactRows.join(equations, [*united, *users], g)
     # the derivatives of the gaps determine the open motions of a body
     free = hold(ContactRows.join(equations, users, g) if united else whole)
-    pushing = [own.normal & (not pair.trial.has_law) for pair, own in zip(pairs, equations)]
+    independent, Q, straight = _restricted(over_constraints, pairs, equations, whole, free, prescribed)
+    return Rows(pairs, equations, whole, independent, Q, straight, heat, None if linear is None else linear.rigid)
+
+
+def _restricted(
+    over_constraints: OverConstraints,
+    pairs: Sequence[Interface],
+    equations: Sequence[ContactRows],
+    whole: ContactRows,
+    free: Bools,
+    prescribed: Array,
+) -> tuple[IndependentEquations | None, Restriction, Restriction]:
+    """Resolution of conflicts of all equations, Q, and Q without friction, see ``make_rows`` (collective)."""
+    pushing, g = [own.normal & (not pair.trial.has_law) for pair, own in zip(pairs, equations)], prescribed.shape[1]
     pushing += [np.zeros(len(whole) - sum(map(len, equations)), dtype=bool)]
     Q, independent = over_constraints.restrict(whole.rows, free, prescribed, np.concatenate(pushing))
     rotated = Q
@@ -273,7 +292,7 @@ def make_rows(
         except DependentRingError as error:
             _refuse_wedged(pairs, test, error.rows[: len(test)])
             raise
-    return Rows(pairs, equations, whole, independent, rotated, Q, heat, None if linear is None else linear.rigid)
+    return independent, rotated, Q
 
 
 def _meet(rigid: Sequence[Interface]) -> None:
