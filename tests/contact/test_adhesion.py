@@ -54,8 +54,8 @@ def test_pull_off_of_a_sphere(coupling):
     for step in uem.load_steps(problem, 10):
         pulls.append(float(problem.reaction(tags["bottom"])[1]))
         assert contact.resultant().force[1] == pytest.approx(-pulls[-1], rel=1e-6)
-        # softening is left out for a few iterations only
-        assert step.newton_iterations < 35
+        # contactors at the edge of the contact that are not yet to be released stay
+        assert step.newton_iterations <= 6
     assert pulls[0] > 0 and min(pulls) == pytest.approx(-1.5 * np.pi * w * R, rel=0.04)
 
 

@@ -52,7 +52,8 @@ AS_LONG_IF_CHEAP = 10
 #: A state that comes again with more than this part of the residual that it had has led nowhere.
 #: [convention; norm of the residual; test_exchanges.py::test_states_that_come_again]
 NO_LESS = 0.9
-#: Curvature of contact that could make the tangent indefinite is left out until so much of the residual is left.
+#: Curvature of contact that could make the tangent indefinite is left out until so much of the residual is left; releases with which
+#: bodies jump are put off as often as the residual has fallen to this part.
 #: [convention; norm of the residual; test_exchanges.py::test_convex_until_it_gets_better]
 WHOLE_AGAIN = 0.1
 #: States of a step may come again so often. [convention; rounds; test_exchanges.py::test_states_that_come_again]
@@ -103,12 +104,19 @@ class Exchanges:
         self._rounds = 0
         #: Whether the curvature is convex, and the residual norm at which it became so; zero to set it at the next visit.
         self.convex, self._from = False, 0.0
+        #: Norm of the last residual, and of the last one at which contactors stayed that would have let bodies jump.
+        self._norm = self._stayed = np.inf
         self.begin()
 
     @property
     def softens(self) -> bool:
         """Whether contacts soften, and bodies need not follow an unstable path: without softening their energy falls in any case."""
         return self.may_jump and any(pair.trial.cohesion is not None for pair in self._pairs)
+
+    @property
+    def jumps(self) -> bool:
+        """Whether softening is left out, after prescribed values have been reached."""
+        return self.softens and self.straight and bool(self._visits)
 
     @staticmethod
     def climbs(solver: UnitedSolver, step: Increment) -> bool:
@@ -128,6 +136,9 @@ class Exchanges:
         """Begin another linearised problem."""
         self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
         self._number, self._alone, self._rule, self._on_arrays = 0, 0, Rule.ALL, False
+        #: States before contactors were released, and whether they are kept although these violate their conditions.
+        self._before: list[PairState] | None = None
+        self._stays = False
         #: Whether limits are and have been fixed, and the last states without a mechanism.
         self.held = self._were_held = False
         self._known: list[tuple[PairState, Pivot] | None] | None = None
@@ -176,14 +187,22 @@ class Exchanges:
         comm = self._pairs[0].config.comm
         if self.frozen:
             violated = [w.of_contact() for w in violated]
+        if self._stays:
+            return None
         if climbs and not self.straight:
-            self.straight = True
+            # far from equilibrium bodies may jump by an exchange that is none there: the last states without a jump are kept
+            self._stays = self._before is not None and not self.frictional and self._norm <= WHOLE_AGAIN * self._stayed
+            if self._stays and self._before is not None:
+                self._stayed = self._norm if self._visits else np.inf
+                for pair, before in zip(self._pairs, self._before):
+                    pair.take(replace(before, reserved=pair.trial.reserved))
+            self.straight = not self._stays
             return [w.among(np.zeros_like(w.enter)) for w in violated]
         both = zip(violated, self._pairs)
         own = np.sum([(w.count, w.enter.sum(), pair.trial.active.sum(), len(pair.nodes)) for w, pair in both], axis=0)
         told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
         (number, entering, active, every), state = told[:, :4].sum(axis=0), tuple(told[:, 4])
-        self.again = False
+        self.again, self._before = False, None if entering else [pair.trial for pair in self._pairs]
         if not number:
             if not self.held:
                 return None
@@ -294,6 +313,7 @@ class Exchanges:
         Raises:
             ConvergenceError, FrictionError: for other repetitions if no rule is left; names the contactors that cycle.
         """
+        self._norm = norm
         if self.convex:
             self._from = self._from or norm
             self.convex = norm > WHOLE_AGAIN * self._from

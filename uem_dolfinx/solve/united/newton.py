@@ -283,7 +283,9 @@ def _advance(bodies: Bodies, method: ContactMethod, problem: LinearisedProblem, 
             enough = min(bodies.most_past, ENOUGH_DECREASE) if along * work < 0.0 else ENOUGH_DECREASE
             less_work = abs(along) <= max(enough * abs(work), least)
             downhill = (problem.convex or problem.softens) and along < 0.0
-            if problem.convex and downhill and not less_work and length == 1.0:
+            # forces of a contact that falls off evenly drive on at twice the step
+            evenly = problem.softens and abs(along) > max(abs(work) - abs(along), least)
+            if problem.convex and downhill and (evenly or not less_work) and length == 1.0:
                 return _downhill(bodies, method, state, start, step)
             if less_work or downhill or first(norms(residual)) <= enough * driving(bodies, state.test, step.rhs, step.du):
                 return length

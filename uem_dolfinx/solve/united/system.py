@@ -418,7 +418,7 @@ class BodySystem:
             iterative=self.solver.inexact and state.solved is None,
             passing=passing,
             fits=linear or (self.linear is not None and self.linear.joints_led(CLOSED * self.config.size)),
-            convex=self.exchanges.convex,
+            convex=self.exchanges.convex or self.exchanges.jumps,
             softens=self.exchanges.softens,
         )
 
