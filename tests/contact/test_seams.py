@@ -265,19 +265,37 @@ def test_seams_of_both_bodies(coupling, degree, friction):
     assert force == pytest.approx(other, abs=1e-9 * np.abs(force).max())
 
 
-@pytest.mark.parametrize("n, degree", [((6, 5), 1), slow((5, 6), 1), slow((6, 5), 2), slow((5, 6), 2)])
-def test_nodes_of_both_bodies(n, degree):
+def pressed_layers(n, degree, push, coupling, shift=0.0):
+    """Two layers with a seam, the upper one's at ``shift``, pressed together by ``push``: problem, contact, and its top."""
+    at_ends = [(0.0, PERIOD), (shift, PERIOD + shift)]
+    bodies = [box("quadrilateral", [at_ends[k][0], k - 1.0], [at_ends[k][1], k], [n[k], 2]) for k in (0, 1)]
+    s = scene(COMM, "quadrilateral", bodies)
+    V = compat.function_space(s.mesh, degree, (2,))
+    u, top = fem.Function(V), s.tag("top", 1, at(1, 1.0))
+    bcs = clamp(V, s.tag("bottom", 0, at(1, -1.0))) + clamp(V, top, value=[0.0, -push])
+    contact = uem.Contact(s.tag("upper", 1, at(1, 0.0)), s.tag("lower", 0, at(1, 0.0)), coupling=coupling)
+    seams = [uem.periodic(*(s.tag(f"{k}{x}", k, at(0, x)) for x in at_ends[k][::-1])) for k in (0, 1)]
+    return uem.UnitedProblem(linear(u, 10.0), u, bcs=bcs, contacts=[contact], equations=seams, rtol=1e-11), contact, top
+
+
+@pytest.mark.parametrize("coupling", ["mortar", slow("node_to_surface")])
+@pytest.mark.parametrize("shift, warnings", [(0.37, 1), (-0.37, 1), (0.01, 0), (0.0, 0)])
+def test_contactors_past_the_seam_of_their_target(shift, warnings, coupling, caplog):
+    """Where contactors start past the end that a periodic target has at its seam, a warning says that contact is missing."""
+    pressed_layers((6, 5), 1, 0.005, coupling, shift)
+    assert COMM.bcast(sum("the seam of a periodic body" in r.getMessage() for r in caplog.records)) == warnings
+
+
+@pytest.mark.parametrize(
+    "n, degree, push",
+    [((6, 5), 1, 0.05), ((6, 5), 1, 0.005), *(slow((6, 5), 1, push) for push in (0.02, 1e-3, 1e-4)), slow((4, 9), 1, 0.05)]
+    + [slow((5, 6), 1, 0.05), slow((6, 5), 2, 0.05), slow((5, 6), 2, 0.05)],
+)
+def test_nodes_of_both_bodies(n, degree, push):
     """Where both bodies have a seam, and meshes do not match, equations of nodes depend on each other but for the strain."""
     found = []
     for coupling in ("node_to_surface", "mortar"):
-        bodies = [box("quadrilateral", [0.0, k - 1.0], [PERIOD, k], [n[k], 2]) for k in (0, 1)]
-        s = scene(COMM, "quadrilateral", bodies)
-        V = compat.function_space(s.mesh, degree, (2,))
-        u, top = fem.Function(V), s.tag("top", 1, at(1, 1.0))
-        bcs = clamp(V, s.tag("bottom", 0, at(1, -1.0))) + clamp(V, top, value=[0.0, -0.05])
-        contact = uem.Contact(s.tag("upper", 1, at(1, 0.0)), s.tag("lower", 0, at(1, 0.0)), coupling=coupling)
-        seams = [uem.periodic(*(s.tag(f"{k}{x}", k, at(0, x)) for x in (PERIOD, 0.0))) for k in (0, 1)]
-        problem = uem.UnitedProblem(linear(u, 10.0), u, bcs=bcs, contacts=[contact], equations=seams, rtol=1e-11)
+        problem, contact, top = pressed_layers(n, degree, push, coupling)
         (step,) = run(problem)
         assert len(step.iterations) - 1 <= 4
         found.append(contact.resultant().force)

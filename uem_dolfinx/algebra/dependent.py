@@ -20,7 +20,7 @@ from enum import IntEnum
 import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, least_left, send
-from uem_dolfinx.algebra.rings import DEPENDENT, components
+from uem_dolfinx.algebra.rings import components
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import gathered, reduced
@@ -49,7 +49,8 @@ class Rank(IntEnum):
 
     FIRM = 0  # equations that are never dropped in favour of others
     WITHIN = 1  # equations of contactors in front of a facet
-    PAST_END = 2  # equations of contactors past an end of the target
+    LEFT_OUT = 2  # equations that have been dropped before
+    PAST_END = 3  # equations of contactors past an end of the target
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,32 @@ class Group:
     movable: Array
     pushing: Bools
 
-    def forces(self, mu: Array) -> Array:
+    def forces(self, mu: Array, gap: Array) -> Array:
         """Forces of the conflicting equations ``(m,)`` from those of the independent ones ``(k,)``: the least, if none pulls.
 
         Otherwise none pulls, if forces without a pull balance the same loads; else those pull whose contactors the loads lift off
-        while the others stay.
+        while the others stay. Where a dropped equation has a negative ``gap (m,)``, one pulls in its place, see ``_exchanged``.
         """
+        return self._exchanged(self._shared(mu), gap)
+
+    def _exchanged(self, lam: Array, gap: Array) -> Array:
+        """Forces ``lam (m,)`` with a pull of the equation that a dropped one of negative ``gap (m,)`` replaces, if none pulls yet.
+
+        The dropped equation is a combination of others. It takes over their forces by its coefficients, until the first is zero:
+        without that one, the dropped equation is independent, and closes its gap [Dantzig's ratio test].
+        """
+        most, inside = np.abs(lam).max(initial=0.0), np.where(self.redundant & self.pushing, gap, 0.0)
+        if inside.min(initial=0.0) >= 0.0 or (lam[self.pushing] < -NEGLIGIBLE * most).any():
+            return lam
+        i, kept = int(inside.argmin()), np.flatnonzero(~self.redundant)
+        c = _least(self.movable[kept], self.movable[[i]])[:, 0]
+        gives = self.pushing[kept] & (c > NEGLIGIBLE)
+        if gives.any():
+            lam[kept[gives][np.argmin(lam[kept[gives]] / c[gives])]] = -most
+        return lam
+
+    def _shared(self, mu: Array) -> Array:
+        """Forces of the conflicting equations ``(m,)`` from those of the independent ones ``(k,)``, see ``forces``."""
         lam = self.shares @ mu
         if not (lam[self.pushing] < -NEGLIGIBLE * np.abs(lam).max(initial=0.0)).any():
             return lam
@@ -122,6 +143,7 @@ class IndependentEquations:
         ring: mask of equations that follow each other in rings and depend on each other ``(m,)``, or None.
         firm: mask of equations that are never dropped, and depend on no other firm ones ``(m,)``, or None.
         pushing: mask of equations with forces that cannot be negative ``(m,)``, or None.
+        left_out: mask of equations that have been dropped before, and are dropped again where they depend on others ``(m,)``, or None.
     """
 
     def __init__(
@@ -132,6 +154,7 @@ class IndependentEquations:
         ring: Bools | None = None,
         firm: Bools | None = None,
         pushing: Bools | None = None,
+        left_out: Bools | None = None,
     ):
         #: mask of given equations that were dropped because they depend on others ``(m,)``, known after ``forces``.
         self.redundant: Bools = np.zeros(len(equations), dtype=bool)
@@ -148,7 +171,7 @@ class IndependentEquations:
         self._space, self._rank = space, _ranks_of_groups(space, equations, self._conflicting)
         together = self._gather(equations)
         none = np.zeros(len(equations), dtype=bool)
-        masks = (none if mask is None else mask for mask in (firm, pushing))
+        masks = (none if mask is None else mask for mask in (firm, pushing, left_out))
         self._groups = _solve(space, together, free, *self._gathered.send(*(mask[self._conflicting] for mask in masks)))
         self._scatter(equations)
 
@@ -198,25 +221,28 @@ class IndependentEquations:
         given[~self._conflicting] = of_independent[: int((~self._conflicting).sum())]
         return given
 
-    def forces(self, multipliers: Array) -> Array:
-        """Contact forces of the given equations from the ``multipliers`` of ``equations`` (collective)."""
+    def forces(self, multipliers: Array, gap: Array) -> Array:
+        """Contact forces of the given equations from the ``multipliers`` of ``equations`` (collective).
+
+        ``gap (m,)``: negative gaps that are to be closed; 0 for all other equations.
+        """
         if not self.found:
             return multipliers
         n = int((~self._conflicting).sum())
         mu = np.empty(len(self._scattered.rows))
         (mu[self._scattered.rows],) = self._scattered.back(multipliers[n:])
         total, end = sum(len(group.given) for group in self._groups), 0
-        lam, redundant = np.zeros(total), np.zeros(total, dtype=bool)
+        lam, redundant, (gap,) = np.zeros(total), np.zeros(total, dtype=bool), self._gathered.send(gap[self._conflicting])
         for group in self._groups:
             start, end = end, end + len(group.independent)
-            lam[group.given], redundant[group.given] = group.forces(mu[start:end]), group.redundant
+            lam[group.given], redundant[group.given] = group.forces(mu[start:end], gap[group.given]), group.redundant
         given = np.empty(len(self._conflicting))
         given[~self._conflicting] = multipliers[:n]
         given[self._sent], self.redundant[self._sent] = self._gathered.back(lam, redundant)
         return given
 
 
-def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools, pushing: Bools) -> list[Group]:
+def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools, pushing: Bools, left_out: Bools) -> list[Group]:
     """Solve conflicting equations group by group, on the rank that has them (collective)."""
     node, place = np.unique(np.concatenate([rows.node, rows.followed]), return_inverse=True)
     movable = space.ask_owners(node, free.astype(float)) > 0
@@ -238,7 +264,8 @@ def _solve(space: Nodes, rows: UnitingEquations, free: Bools, firm: Bools, pushi
         A = np.zeros((len(which), len(columns), g))
         np.add.at(A, (np.arange(len(which)), at[: len(which)]), rows.direction[which])
         np.add.at(A, (np.searchsorted(which, rows.row[terms]), at[len(which) :]), -rows.coefficients[terms])
-        rank = np.where(firm[which], Rank.FIRM, np.where(past[which], Rank.PAST_END, Rank.WITHIN))
+        within = np.where(left_out[which], Rank.LEFT_OUT, Rank.WITHIN)
+        rank = np.where(firm[which], Rank.FIRM, np.where(past[which], Rank.PAST_END, within))
         groups.append(_eliminate(A, -rows.gap[which], movable[columns], node[columns], which, rank, pushing[which]))
     return groups
 
@@ -328,11 +355,10 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
     from scipy.linalg import solve_triangular
 
     rows, nodes, directions = list[int](), list[int](), list[Array]()
-    least = np.where(rank == Rank.FIRM, MOSTLY_PRESCRIBED, DEPENDENT)
     size, left = np.linalg.norm(A * free, axis=2), np.linalg.norm(across, axis=1)
     where = size.argmax(axis=1)
     largest = size[np.arange(len(A)), where]
-    while (rest := rest & (left > least)).any():
+    while (rest := rest & (left > MOSTLY_PRESCRIBED)).any():
         among = rest & (rank == rank[rest].min())
         i = int(np.argmax(np.where(among, largest, -1.0)))
         t, rest[i] = int(where[i]), False

@@ -17,7 +17,8 @@ import numpy.typing as npt
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints
 from uem_dolfinx.parallel import Exchange
 
-#: An equation whose direction has less than this part left in the free components of its node cannot eliminate any.
+#: An equation whose direction has less than this part left in the free components of its node cannot eliminate any, and one that
+#: has no more across other equations depends on them. Surfaces that bend under load leave more, the first order of their strain.
 #: [convention; part of the direction's length; test_equations.py::test_what_a_condition_leaves_of_a_normal]
 MOSTLY_PRESCRIBED = 1e-6
 #: Coefficients below it are rounding: nothing follows by them, and changes below it make no new P.

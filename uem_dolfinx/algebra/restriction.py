@@ -369,7 +369,7 @@ class Restriction:
         ]
         if values:
             # closest points that have moved by rounding do not change P
-            parts += [np.rint(v / NEGLIGIBLE).astype(np.int64).tobytes() for v in (eq.direction, eq.coefficients)]
+            parts += [(np.rint(v / NEGLIGIBLE) + 0.0).tobytes() for v in (eq.direction, eq.coefficients)]
         return zlib.crc32(b"".join(parts))
 
 

@@ -20,16 +20,12 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.equations import NEGLIGIBLE, UnitingEquations, send
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, NEGLIGIBLE, UnitingEquations, send
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import ConflictError
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import agree, gathered, reduced
 
-#: A row that has no more than this part of its length across the others depends on them; the rows of surfaces that bend under load
-#: do so only to the first order of their strain.
-#: [convention; part of the row's length in its free components; test_dependent.py::test_rows_that_depend_nearly]
-DEPENDENT = 2e-3
 #: Parts of a unit displacement below it are rounding.
 #: [derived; directions of length one; test_restriction.py::test_rings_that_fade]
 FADED = np.finfo(float).eps
@@ -193,7 +189,7 @@ def _close(there: UnitingEquations, lift: Array, rows: Ints) -> _Closed | None:
     inverse = LinearOperator(
         (m, m), matvec=factor.solve, rmatvec=lambda v: factor.solve(v, "T"), matmat=factor.solve, dtype=float
     )
-    if not onenormest(inverse) <= 1.0 / DEPENDENT:
+    if not onenormest(inverse) <= 1.0 / MOSTLY_PRESCRIBED:
         return None
     B = (C - M @ A).tocsc()
     used = np.unique(np.flatnonzero(np.diff(B.indptr)) // g)

@@ -20,7 +20,6 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
-from uem_dolfinx.algebra.rings import DEPENDENT
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.conditions.equation import GivenRows
 from uem_dolfinx.conditions.places import COINCIDENT, NEAR
@@ -149,7 +148,7 @@ def _gauss_jordan(A: Array, free: Bools, spare: Bools) -> tuple[Array, Array, In
         size = np.abs(R[i]) * free
         if size.max() <= MOSTLY_PRESCRIBED * scale[i]:
             continue
-        good = (size > DEPENDENT * size.max()) & ~spare
+        good = (size > MOSTLY_PRESCRIBED * size.max()) & ~spare
         p = pivot[i] = int(np.argmax(np.where(good, size, 0.0) if good.any() else size))
         T[i], R[i] = T[i] / R[i, p], R[i] / R[i, p]
         factor = R[:, p].copy()
@@ -218,7 +217,7 @@ def chosen(
     taken: list[Array] = []
     kept: list[int] = []
     for i in range(len(C)):
-        if np.linalg.norm(rest[i]) > DEPENDENT:
+        if np.linalg.norm(rest[i]) > MOSTLY_PRESCRIBED:
             kept.append(i)
             across, rest = _without(across, rest[i]), _without(rest, rest[i])
     places = np.round(s.X / (COINCIDENT * config.size))
@@ -227,7 +226,7 @@ def chosen(
         while len(taken) + len(kept) < across.shape[2]:
             size = np.where(allowed, np.linalg.norm(across, axis=2), 0.0)
             largest = float(reduced(config.comm, size.max(initial=0.0), op=MPI.MAX))
-            if largest <= DEPENDENT:
+            if largest <= MOSTLY_PRESCRIBED:
                 break
             # of equal candidates the first by position, on any number of ranks
             node, component = np.nonzero(size >= (1.0 - NEAR) * largest)

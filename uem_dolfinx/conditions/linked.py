@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uem_dolfinx.algebra.rings import DEPENDENT
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.conditions.joints import Joint, Link
 from uem_dolfinx.conditions.relations import Relation
@@ -78,7 +78,7 @@ class Linked:
         """
         best, now, least, scale = list(places), list(places), np.inf, self._sets.scale
         _, size, axes = np.linalg.svd(firm)
-        open_ = axes[np.count_nonzero(size > DEPENDENT) :].T
+        open_ = axes[np.count_nonzero(size > MOSTLY_PRESCRIBED) :].T
         for _ in range(MOST_CLOSINGS):
             C, value, _ = self.rows(now)
             C, off = C[kept], (value - wanted)[kept]
@@ -86,7 +86,7 @@ class Linked:
             if not miss < least:
                 break
             best, least = now, miss
-            dz = scale * (open_ @ np.linalg.lstsq(C * scale @ open_, -off, rcond=DEPENDENT)[0])
+            dz = scale * (open_ @ np.linalg.lstsq(C * scale @ open_, -off, rcond=MOSTLY_PRESCRIBED)[0])
             now = [at.moved(dz[self._sets[i]]) for i, at in enumerate(now)]
         return best
 

@@ -15,7 +15,7 @@ from ufl.core.multiindex import MultiIndex
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from uem_dolfinx import given
-from uem_dolfinx.algebra.rings import DEPENDENT
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED
 from uem_dolfinx.arrays import Array, Bools
 from uem_dolfinx.conditions.equation import Value, checked_value, values_of
 from uem_dolfinx.conditions.places import is_point, nodes_at
@@ -133,7 +133,7 @@ class RigidCoupling(given.Sealed):
         arms = self._set.X - self._set.middle
         spread = reduced(config.comm, arms.T @ arms)
         sizes = np.linalg.eigvalsh(spread)
-        if not sizes[-1] > 0 or (config.gdim == 3 and np.sqrt(max(sizes[-2], 0.0) / sizes[-1]) < DEPENDENT**2):
+        if not sizes[-1] > 0 or (config.gdim == 3 and np.sqrt(max(sizes[-2], 0.0) / sizes[-1]) < MOSTLY_PRESCRIBED):
             raise SurfaceError(
                 f"the RigidCoupling of '{self.name}': its {self._set.count} nodes lie on a line or at one point, so that its "
                 "rotation is undetermined: expected at least two nodes in the plane, three that are not on a line in space"

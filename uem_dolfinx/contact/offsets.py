@@ -68,6 +68,16 @@ class Offsets:
         pair = self.pair
         if not hasattr(pair, "kinematics"):  # contacts that are treated together are placed together
             pair.project()
-        p, height = pair.kinematics.projection, pair.kinematics.heights()
+        p, height, before = pair.kinematics.projection, pair.kinematics.heights(), np.inf
         most = np.where(np.isfinite(p.facet_size), p.facet_size, pair.max_penetration) if reach is True else reach
-        self.adjusted = np.where((np.abs(height) <= most) & ~pair.off, height, 0.0)
+        near = (np.abs(height) <= most) & ~pair.off
+        # weights of mortar change with what is open
+        while 0.0 < (change := self._change(now := np.where(near, height, 0.0))) < before:
+            self.adjusted, before = now, change
+            self._hand_over()
+            pair.project()
+            height = pair.kinematics.heights()
+
+    def _change(self, adjusted: Array) -> float:
+        """Largest difference of lengths ``(n,)`` from those that are adjusted now (collective)."""
+        return float(reduced(self.pair.config.comm, float(np.abs(adjusted - self.adjusted).max(initial=0.0)), op=MPI.MAX))

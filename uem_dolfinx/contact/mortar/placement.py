@@ -246,7 +246,8 @@ class MortarKinematics(PlacedOnTarget):
 
     def heights(self) -> Array:
         """Nodal heights of the rows (collective)."""
-        return self.of.heights(self.rows)
+        heights, offset = self.of.heights(self.rows), self.of.offset
+        return heights if offset is None else heights + offset
 
     def means(self) -> tuple[tuple[Ints, Ints, Array], tuple[Ints, Ints, Array]]:
         """Means by the integrals of the dual functions over the covered part; values at the nodes of other contactors (collective)."""

@@ -17,6 +17,7 @@ from uem_dolfinx.arrays import Bools, Indices
 from uem_dolfinx.conditions.seams import seams_of
 from uem_dolfinx.contact.both_sides import OfBothSides
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.warnings.checks import SLIPPED
 from uem_dolfinx.errors import ConvergenceError, OverdeterminedError, UEMError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import facets_of
@@ -85,6 +86,30 @@ def _side(config: Configuration, tag: Tag) -> float:
     sides = np.linalg.norm(x[:, ends[:, 1]] - x[:, ends[:, 0]], axis=2)
     total, number = reduced(config.comm, np.array([sides.sum(), sides.size]))
     return float(total / max(number, 1.0))
+
+
+def warn_past_seams(contacts: Sequence[Any]) -> None:
+    """Warn of contactors that start past the end of a target that goes on at its seam, on the other side of the body (collective).
+
+    There are no images of a target: contact is missing there, and what is beside it bears that force.
+    """
+    for contact in contacts:
+        pair, config, seams = contact.pair, contact.config, seams_of(contact.config)
+        if seams is None or not isinstance(contact.target, Tag) or contact.contactor.dim == 0:
+            continue
+        theirs = surface_nodes(config, contact.target)
+        joined = np.zeros((config.n_owned, 1))
+        joined[theirs[np.isin(config.to_global(theirs), seams.groups(config, theirs)[0])]] = 1.0
+        p, share = pair.kinematics.nearest, pair.kinematics.ends.share
+        bare = pair.off if share is None else pair.off | ((share >= 0.0) & (share < 1.0 - SLIPPED))
+        at_seam = (config.ask_owners(p.nodes.ravel(), joined).reshape(p.nodes.shape) > 0).any(axis=1)
+        count = reduced(config.comm, int((bare & at_seam & (np.abs(p.gap) < p.facet_size)).sum()))
+        if count:
+            logger.warning(
+                "%s: the target ends at the seam of a periodic body, and %d contactors start past this end: contact is missing there, "
+                "and pressures beside it are too large; cut both bodies at the same place",
+                contact.name, count,
+            )  # fmt: skip
 
 
 def warn_of_seams(pairs: Sequence[Interface]) -> None:

@@ -136,9 +136,10 @@ class Watch:
 
             self._rigid_sides = RigidSides(contacts, rigid)
         if contacts and contacts[0].config.equations:
-            from uem_dolfinx.contact.warnings.rigid_sides import warn_of_seams
+            from uem_dolfinx.contact.warnings.rigid_sides import warn_of_seams, warn_past_seams
 
             warn_of_seams([contact.pair for contact in contacts])
+            warn_past_seams(contacts)
         self._edges: list[tuple[EdgesInside, list[WatchedContact]]] = []
         self._confined: Confined | None = None
         by_nodes = any(c.sees_corners and isinstance(c.target, Tag) for c in contacts)

@@ -17,6 +17,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DependentRingError
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.pair.interface import Interface
+from uem_dolfinx.contact.seam.active_set import TOUCHING
 from uem_dolfinx.contact.seam.placement import ContactRows, Traction
 from uem_dolfinx.errors import ConflictError, FrictionError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -111,7 +112,7 @@ class OverConstraints:
         return self._rigid.rewritten(equations.select(~last)), [equations.select(last)]
 
     def restrict(
-        self, equations: UnitingEquations, free: Bools, prescribed: Array, pushing: Bools | None = None
+        self, equations: UnitingEquations, free: Bools, prescribed: Array, *masks: Bools
     ) -> tuple[Restriction, IndependentEquations | None]:
         """P or Q of equations, and the resolution of their conflicts (collective).
 
@@ -119,13 +120,13 @@ class OverConstraints:
             equations: of all pairs together, followed by the equations of users.
             free: mask of free components ``(n_rows, gdim)``.
             prescribed: increments prescribed by Dirichlet conditions ``(n_rows, gdim)``.
-            pushing: mask of equations with forces that cannot be negative ``(m,)``, or None.
+            masks: equations with forces that cannot be negative, and those that have been left out before ``(m,)``, or none.
         """
         given, rigid = self.parted(equations)
         firm, g = np.arange(len(given)) >= len(given) - self._n_linear, prescribed.shape[1]
-        pushing = None if pushing is None else pushing[: len(given)]
+        masks = tuple(mask[: len(given)] for mask in masks)
         left = free if self._rigid is None else self._rigid.left(free)
-        independent = self._independent(given, left, None, firm, pushing) if self.contestable else None
+        independent = self._independent(given, left, None, firm, *masks) if self.contestable else None
         own = given if independent is None else independent.equations
         stacked = self.stacked or (independent is not None and independent.found)
         every = joined(own, rigid, g)
@@ -136,7 +137,7 @@ class OverConstraints:
             return self._last, independent
         except DependentRingError as error:
             ring = error.rows[: len(own)] if independent is None else independent.of_given(error.rows[: len(own)])
-        independent = self._independent(given, left, ring, firm, pushing)
+        independent = self._independent(given, left, ring, firm, *masks)
         return Restriction(self._unknowns, joined(independent.equations, rigid, g), free, prescribed), independent
 
     def _independent(self, given: UnitingEquations, free: Bools, *masks: Bools | None) -> IndependentEquations:
@@ -277,9 +278,13 @@ def _restricted(
     prescribed: Array,
 ) -> tuple[IndependentEquations | None, Restriction, Restriction]:
     """Resolution of conflicts of all equations, Q, and Q without friction, see ``make_rows`` (collective)."""
-    pushing, g = [own.normal & (not pair.trial.has_law) for pair, own in zip(pairs, equations)], prescribed.shape[1]
-    pushing += [np.zeros(len(whole) - sum(map(len, equations)), dtype=bool)]
-    Q, independent = over_constraints.restrict(whole.rows, free, prescribed, np.concatenate(pushing))
+    masks, start, g = np.zeros((2, len(whole)), dtype=bool), 0, prescribed.shape[1]
+    for pair, own in zip(pairs, equations):
+        part = slice(start, start + len(own))
+        masks[0, part] = own.normal & (not pair.trial.has_law)
+        masks[1, part] = own.normal & pair.trial.redundant[own.contactor]
+        start += len(own)
+    Q, independent = over_constraints.restrict(whole.rows, free, prescribed, *masks)
     rotated = Q
     if whole.tilt is not None:
         test, last = over_constraints.parted(whole.Q)
@@ -350,7 +355,8 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
     lam, last = np.split(rows.test.multipliers(y), [len(rows.test.equations) - n_rigid])
     redundant = np.zeros(len(lam), dtype=bool)
     if rows.independent is not None:
-        lam, redundant = rows.independent.forces(lam), rows.independent.redundant
+        redundant = rows.independent.redundant
+        lam = rows.independent.forces(lam, _inside(rows, len(redundant), du))
     found, start = [], 0
     for pair, own in zip(rows.pairs, rows.equations):
         part = slice(start, start + len(own))
@@ -368,6 +374,20 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
         last = rows.rigid.beside(last, rows.whole.Q.select(np.arange(len(rows.whole)) < len(lam)), lam)
     known = dict(zip(map(id, rows.pairs), found))
     return [known.get(id(pair)) or pair.traction for pair in pairs], np.append(lam[start:], last)
+
+
+def _inside(rows: Rows, m: int, du: Array | None) -> Array:
+    """Penetrations along the normals of contactors, after an increment ``du``; 0 in all other of m rows (collective)."""
+    inside = np.zeros(m)
+    if not rows.conflict:
+        return inside
+    start = 0
+    for pair, own in zip(rows.pairs, rows.equations):
+        gap = pair.kinematics.gap if du is None else pair.kinematics.gap_rows.gaps(du)
+        gap = np.where(pair.kinematics.movable & (gap < -TOUCHING * pair.config.size), gap, 0.0)
+        inside[start : start + len(own)] = np.where(own.normal, gap[own.contactor], 0.0)
+        start += len(own)
+    return inside
 
 
 def in_turns(pair: Interface) -> list[Ints]:
