@@ -67,8 +67,12 @@ def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
     """A path, the same on all ranks; InputTypeError or InputError if it is no path (collective)."""
     with agreed(comm):
         given.kind(what, value, isinstance(value, (str, os.PathLike)), "the path of a file", "None is none")
-        if not Path(value).name:
+        if not Path(value).name or "\0" in str(value):
             raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
+        if (path := Path(value)).exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(
+                given.sentence(what, str(value), "the path of a file", "a device or a pipe would be replaced by one")
+            )
     given.alike(comm, "files", **{what: str(value)})
     return Path(value)
 

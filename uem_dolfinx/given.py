@@ -84,9 +84,9 @@ def truth(value: Any) -> bool:
 
 
 def numbers(value: Any) -> Array:
-    """Copy of a value as an array of numbers; TypeError as of other objects for expressions of UFL, and for True and False."""
-    if symbolic(value) or truth(value):
-        raise TypeError("an expression of UFL, or True or False, is no number")
+    """Copy of a value as an array of numbers; TypeError for all else, as expressions of UFL, truth, None, texts and complex numbers."""
+    if symbolic(value) or truth(value) or value is None or np.asarray(value).dtype.kind in "USc":
+        raise TypeError("an expression of UFL, True, False, None, a text or a complex number is no real number")
     return np.array(value, dtype=float)
 
 

@@ -116,7 +116,7 @@ def _checked(V: Any, component: int | None, value: Any) -> Any:
             raise SpaceError(f"the value '{value.name}' of a Dirichlet condition is no Function of {wanted}")
     else:
         try:
-            array = np.asarray(value.value if isinstance(value, fem.Constant) else value, dtype=PETSc.ScalarType)
+            array = given.numbers(value.value if isinstance(value, fem.Constant) else value)
         except (TypeError, ValueError):
             array = None
         expected = "a number, or a Constant or a Function, or numbers for all components"

@@ -38,6 +38,20 @@ def bars(coupling="node_to_surface", tied=True, equations=lambda s: (), contacto
     return problem, uem.EnergyBook(problem, law.energy(u) * ufl.dx), tie, s
 
 
+def test_a_rigid_lid_that_is_at_rest_at_first():
+    """Without a force there is only what a law of the deformation gradient rounds, which no later force is compared with."""
+    s = scene(COMM, "hexahedron", [box("hexahedron", [0.0] * 3, [1.0] * 3, [2, 2, 2])])
+    V = compat.function_space(s.mesh, 1, (3,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    lid = uem.RigidCoupling(s.tag("lid", 0, at(2, 1.0)), (0.5, 0.5, 1.0), force=lambda t: (0.0, 0.0, 1e-3 * t))
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=uem.CentralDifferences(), contactors="massy")
+    problem = uem.UnitedProblem(uem.NeoHooke(1.0, 0.3).residual(u, v) * ufl.dx, u, couplings=[lid], dynamics=dynamics)
+    for step in uem.time_steps(problem, end=1.0):
+        pass
+    # the impulse of steps that begin without a force
+    assert problem.dynamics.momentum()[2] == pytest.approx(0.5e-3 * step.time**2, rel=1e-9)
+
+
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_a_wave_through_a_tie(coupling):
     """A moving bar tied to one at rest: momentum to rounding, the surfaces together, both as fast after the wave has been to and fro."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import ufl
@@ -135,7 +137,43 @@ CLASSES = [
     ("arc_length", uem.Dissipation, lambda f: along(uem.Dissipation)),
     ("estimate", uem.ErrorLimit, lambda f: estimated(uem.ErrorLimit)),
 ]  # fmt: skip
+
+
+def lone(result):
+    b = blocks(COMM, "triangle")
+    return result(uem.Contact(b.high, b.low))
+
+
+def pushed(value):
+    b = blocks(COMM, "triangle")
+    return uem.dirichlet(b.V, b.top, 1, value)
+
+
+def into(folder, name):
+    """A checkpoint in a pipe or a path that is none."""
+    if COMM.rank == 0 and not (folder / "pipe").exists():
+        os.mkfifo(folder / "pipe")
+    COMM.barrier()
+    uem.write_checkpoint(f"{folder}/{name}", one_step().state())
+
+
 CASES = {
+    "active contactors of no problem": (uem.SurfaceError, "belongs to no problem yet", lambda f: lone(lambda c: c.n_active)),
+    "gaps of no problem": (uem.SurfaceError, "belongs to no problem yet", lambda f: lone(lambda c: c.max_gap())),
+    "pressures of no problem": (uem.SurfaceError, "belongs to no problem yet", lambda f: lone(lambda c: c.max_pressure())),
+    "a Dirichlet value in words": (uem.InputTypeError, "= '-0.01': expected a number", lambda f: pushed("-0.01")),
+    "complex Dirichlet values": (uem.InputError, r"has the shape \(3,\)", lambda f: pushed(lambda x: 1j * x[0])),
+    "no Dirichlet values": (uem.InputError, r"has the shape \(\)", lambda f: pushed(lambda x: None)),
+    "complex friction": (uem.InputTypeError, "numbers", lambda f: rough(lambda x: 0.3 + 0j * x[0])),
+    "a path with a null": (uem.InputError, "the path of a file", lambda f: into(f, "a\0b")),
+    "a path that is a pipe": (uem.InputError, "a device or a pipe would be replaced", lambda f: into(f, "pipe")),
+    **{
+        f"{what} = {value!r} between steps": (error, what, lambda f, what=what, value=value: setattr(one_step(), what, value))
+        for what, value, error in (
+            ("rtol", "1e-8", uem.InputTypeError), ("rtol", np.nan, uem.InputError), ("max_iterations", 0, uem.InputError),
+            ("line_search", "no", uem.InputTypeError), ("verbose", "yes", uem.InputTypeError),
+        )
+    },
     "general contact's force": (uem.SurfaceError, "belongs to no problem yet", lambda f: uem.GeneralContact().resultant()),
     "general contact's bodies": (uem.SurfaceError, "belongs to no problem yet", lambda f: uem.GeneralContact().touching()),
     "coupling's reaction": (

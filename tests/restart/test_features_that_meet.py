@@ -273,6 +273,31 @@ def test_gone_on_with(make, tmp_path):
     same(last, whole, exact=make is not explicit_steps_about_a_hinge)
 
 
+def test_other_fields_and_a_tie(tmp_path):
+    """What a file has of displacement and temperature is there where ties are read, too."""
+
+    def make():
+        b = Blocks(1.0, 1.0)
+        W = uem.function_space(b.mesh, [("Lagrange", 1, (2,)), 1])
+        w, (v, q) = fem.Function(W), ufl.TestFunctions(W)
+        u, T = ufl.split(w)
+        F = (ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(v)) + ufl.inner(ufl.grad(T), ufl.grad(q)) - 0.1 * T * ufl.div(v)) * ufl.dx
+        bcs = [uem.dirichlet(W.sub(0), b.scene.tag("base", 0, at(1, -1.0))), uem.dirichlet(W.sub(0), b.lid, 0, 0.05)]
+        bcs += [uem.dirichlet(W.sub(1), b.lid, value=1.0), uem.dirichlet(W.sub(1), b.top)]
+        return uem.UnitedProblem(F, w, displacement=0, bcs=bcs, contacts=[uem.Contact(b.foot, b.top, tied=True)]), w
+
+    def sizes(w):
+        return [uem.integrate(ufl.inner(part, part) * ufl.dx) for part in ufl.split(w)]
+
+    path = COMM.bcast(str(tmp_path / "run"))
+    problem, w = make()
+    list(uem.load_steps(problem, 2))
+    uem.write_checkpoint(path, problem.state())
+    other, read = make()
+    uem.read_checkpoint(path, other.state())
+    assert min(sizes(w)) > 1e-5 and sizes(read) == pytest.approx(sizes(w), rel=1e-12)
+
+
 @pytest.mark.parametrize("iterations", [1, 50])
 @pytest.mark.parametrize(
     "make", [m for m in MEETINGS if "time" not in m.__name__ and "explicit" not in m.__name__], ids=lambda f: f.__name__

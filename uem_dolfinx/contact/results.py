@@ -135,11 +135,11 @@ class ContactResults(HeatResults):
     @property
     def n_active(self) -> int:
         """Number of active contactors over all ranks (collective)."""
-        return int(reduced(self.config.comm, int(self.pair.united.sum())))
+        return int(reduced(self.pair.config.comm, int(self.pair.united.sum())))
 
     def max_gap(self) -> float:
         """Largest gap of an active contactor, a length (collective)."""
-        return float(reduced(self.config.comm, self.pair.largest_gap_here(), op=MPI.MAX))
+        return float(reduced(self.pair.config.comm, self.pair.largest_gap_here(), op=MPI.MAX))
 
     @cached_property
     def surface(self) -> Areas:
@@ -234,7 +234,7 @@ class ContactResults(HeatResults):
 
     def max_pressure(self) -> float:
         """Largest contact pressure, a force per area (collective)."""
-        return float(reduced(self.config.comm, float(self.pressures.max(initial=0.0)), op=MPI.MAX))
+        return float(reduced(self.pair.config.comm, float(self.pressures.max(initial=0.0)), op=MPI.MAX))
 
     @property
     def pressure(self) -> fem.Function:

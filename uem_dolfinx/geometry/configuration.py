@@ -113,6 +113,10 @@ class Configuration(Nodes):
         """Values of all unknowns including ghosts ``(n,)`` from Functions as in ``functions``."""
         return np.array(functions[self.name].x.array)
 
+    def values_at(self, displacement: fem.Function) -> Array:
+        """Values of all unknowns including ghosts ``(n,)``, with another displacement."""
+        return np.array(displacement.x.array)
+
     @property
     def displacement(self) -> Array:
         """Displacement of the local nodes ``(n_local, gdim)``, ghosts included (to be read)."""

@@ -153,6 +153,12 @@ class ConfigurationAmongFields(Configuration):
             values[dofs] = functions[name].x.array
         return values
 
+    def values_at(self, displacement: fem.Function) -> Array:
+        """Values of all unknowns including ghosts ``(n,)``, with another displacement."""
+        values = np.array(self.whole.x.array)
+        values[self.dofs.ravel()] = displacement.x.array
+        return values
+
     def shift(self, nodes: Any, way: Array) -> None:
         """Move distinct local nodes ``(n,)``, or a slice, by ``way (n, gdim)``; ghosts are not updated."""
         self.whole.x.array[self.dofs[nodes]] += way

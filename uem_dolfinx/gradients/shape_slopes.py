@@ -87,7 +87,7 @@ def of_tie(tie: Tie, bond: Array) -> ShapeSlopes:
     config, target, g, i = tie.config, tie.target, tie.config.gdim, np.flatnonzero(tie.tied)
     assert isinstance(target, MeshTarget)
     own = tie.nodes[i]
-    with config.at(config.values_of(config.functions() | {"displacement": tie.at})):
+    with config.at(config.values_at(tie.at)):
         X = config.x[own]
         p = target.project(config.x[tie.nodes])
         tab, height = foot_below(target, p.x[i], p.xi[i], X)

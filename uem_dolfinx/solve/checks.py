@@ -5,7 +5,8 @@ Most checks concern this rank only; the caller makes the ranks agree.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
@@ -256,3 +257,10 @@ def _warn_of_two_values(config: Configuration, bcs: Sequence[Any], wanted: Array
             "the Dirichlet condition bcs[%d] prescribes %.6g in %s, where a later condition prescribes %.6g, which counts: leave one of "
             "them out at this node", i, first, where, last,
         )  # fmt: skip
+
+
+#: Checks of the settings of Newton's method that may be changed between steps, by name.
+NEWTON: dict[str, Callable[[Any], Any]] = {
+    "rtol": partial(given.number, "rtol", within=given.between(0.0, 1.0)), "max_iterations": partial(given.count, "max_iterations"),
+    "line_search": partial(given.flag, "line_search"), "verbose": partial(given.flag, "verbose"),
+}  # fmt: skip

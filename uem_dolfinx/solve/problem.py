@@ -96,7 +96,7 @@ class UnitedProblem(given.Sealed):
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
 
-    SETTABLE = {"load": check_load} | dict.fromkeys(("rtol", "max_iterations", "line_search", "verbose"))
+    SETTABLE = {"load": check_load} | checks.NEWTON
 
     @end_together(lambda self, F, u, **options: u.function_space.mesh.comm if isinstance(u, fem.Function) else None)
     def __init__(

@@ -134,7 +134,7 @@ class Tie:
         if not self.target.n_nodes:
             self._take_rows(to_surface(config, nodes, self.target, which), off)
             return
-        with config.at(config.values_of(config.functions() | {"displacement": self.at})):
+        with config.at(config.values_at(self.at)):
             if self.means is not None:
                 self.means.let_go()
                 found = self.means.place(self._points, PairState.initial(len(nodes), config.gdim))

@@ -260,7 +260,8 @@ class Bodies:
         """Norm relative to which forces of later steps may be rounding, with the terms of other fields (collective)."""
         told = self.above_rounding(positioned)
         if self._fields is None:
-            return told
+            # laws of the deformation gradient round 1 + grad(u), however small u is; by how much is unknown before the first tangent
+            return told if self.linear or told > self.strain_rounding() > 0.0 else 0.0
         terms, rounding = self._fields.terms(), np.maximum(FORCE_ROUNDING * self._fields.largest(), self.strain_rounding())
         return np.maximum(told, np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
 

@@ -77,6 +77,10 @@ class InertBodies(Bodies):
         self._b.array[:] = self._factor * (self._u.array_r - self.free_to)
         return bool(np.isfinite(self._b.norm()))
 
+    def above_rounding(self, positioned: bool) -> Any:
+        """As of bodies; where nodes are moved to, as those of rigid parts, is rounded as positions are (collective)."""
+        return super().above_rounding(True)
+
     def update_tangent(self) -> PETSc.Mat:
         """M over the square of the step."""
         return self.tangent.K
