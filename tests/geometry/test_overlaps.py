@@ -119,6 +119,22 @@ def test_facets_that_are_affine():
     assert counts[0] == counts[1] < counts[2]
 
 
+def test_the_rule_of_a_pair_does_not_depend_on_others():
+    """A bent pair in one call with a straight one has the points that it has alone, in any order."""
+    shape, x, y = pair_of("quadrilateral", 0.25)
+    bent = x.copy()
+    bent[3, 0] += 0.03
+    one = np.array([1.0])
+    alone = [overlap(Planes.of(shape, a[None], one), (shape, a[None]), (shape, y[None]), one, ONE) for a in (bent, x, bent)]
+    both, signs = np.stack([bent, x, bent]), np.ones(3)
+    found = overlap(Planes.of(shape, both, signs), (shape, both), (shape, np.stack([y, y, y])), signs, np.arange(3))
+    assert len(alone[1].pair) < len(alone[0].pair)
+    for k, expected in enumerate(alone):
+        of_pair = found.pair == k
+        for name in ("xi", "eta", "weight", "gap"):
+            np.testing.assert_array_equal(getattr(found, name)[of_pair], getattr(expected, name))
+
+
 def test_slivers_change_no_integrals():
     """A side of the target that lies on the facet's and turns by 1e-9 either way cuts off a corner more or less, and changes little."""
     turn, sizes = [1, 3, 0, 2], set()

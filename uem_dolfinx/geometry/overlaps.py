@@ -14,13 +14,13 @@ from typing import TypeAlias
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Ints, cross_products
+from uem_dolfinx.arrays import Array, Bools, Ints, cross_products
 from uem_dolfinx.geometry.shapes import FacetShape
 
 #: Smaller segments are rounding of sides that coincide. [convention; part of the contactor facet; test_overlaps.py::test_slivers]
 SLIVER = 1e-12
-#: Facets in space whose maps differ less from affine maps are integrated like affine facets, to 1e-12.
-#: [convention; part of the largest facet; test_overlaps.py::test_facets_that_are_affine]
+#: Pairs of facets in space whose maps differ less from affine maps are integrated like affine facets.
+#: [convention; part of the facet; test_overlaps.py::test_facets_that_are_affine]
 STRAIGHT = 0.01
 #: Increase of the degree of quadrature where maps differ more, and products of shape functions are no polynomials.
 #: [convention; degree; test_overlaps.py::test_products_that_are_no_polynomials]
@@ -90,7 +90,7 @@ def quadrature(shape: FacetShape, straight: bool) -> tuple[Array, Array]:
 
     Args:
         shape: of the facets.
-        straight: whether the maps of all facets are affine, so that the products are polynomials.
+        straight: whether the maps of both facets are affine, so that the products are polynomials.
     """
     cell = "interval" if shape.dim == 1 else "triangle"
     # bilinear functions are of degree 2 along the diagonals
@@ -99,14 +99,14 @@ def quadrature(shape: FacetShape, straight: bool) -> tuple[Array, Array]:
     return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
 
 
-def _affine(shape: FacetShape, y: Array) -> bool:
-    """Whether the maps of facets with nodes ``y (m, nn, fdim)`` in their planes are affine."""
+def _straight(shape: FacetShape, y: Array) -> Bools:
+    """Mask of facets with nodes ``y (m, nn, fdim)`` in their planes whose maps are affine ``(m,)``."""
     # in 2D few points more are enough for derivatives of exact integrals
     if shape.affine or shape.dim == 1:
-        return shape.affine
+        return np.full(len(y), shape.affine)
     corners = y[:, : shape.dim + 1]
     made = corners[:, :1] + np.einsum("af,mfe->mae", shape.nodes, corners[:, 1:] - corners[:, :1])
-    return bool(np.abs(y - made).max(initial=0.0) <= STRAIGHT * np.abs(y - y[:, :1]).max(initial=0.0))
+    return np.abs(y - made).max(axis=(1, 2)) <= STRAIGHT * np.abs(y - y[:, :1]).max(axis=(1, 2))
 
 
 def overlap(planes: Planes, contactor: Facets, target: Facets, sign: Array, facet: Ints) -> Segments:
@@ -124,8 +124,18 @@ def overlap(planes: Planes, contactor: Facets, target: Facets, sign: Array, face
     (low, high), (least, most) = _box(own), _box(its)
     pair = np.flatnonzero(((low[facet] < most) & (least < high[facet]))[:, :-1].all(axis=1))
     planes, own, its, sign = planes.take(facet[pair]), own[facet[pair]], its[pair], sign[facet[pair]]
-    rule = quadrature(shape, _affine(shape, own[:, :, :-1]) and _affine(other, its[:, :, :-1]))
-    place, at, weight = (_intervals if shape.dim == 1 else _polygons)(planes, (shape, own), (other, its), sign, rule)
+    # each pair has the rule of its own facets, whatever other pairs this rank has
+    straight, cut, parts = _straight(shape, own[:, :, :-1]) & _straight(other, its[:, :, :-1]), _polygons, []
+    if shape.dim == 1:
+        cut = _intervals
+    for kind in np.unique(straight) if len(straight) else (True,):
+        which = np.flatnonzero(straight == kind)
+        some = planes.take(which), (shape, own[which]), (other, its[which]), sign[which], quadrature(shape, kind)
+        place, at, weight = cut(*some)
+        parts.append((which[place], at, weight))
+    place, at, weight = (np.concatenate(part) for part in zip(*parts))
+    order = np.argsort(place, kind="stable")
+    place, at, weight = place[order], at[order], weight[order]
     xi, eta = locate(shape, own[place, :, :-1], at), locate(other, its[place, :, :-1], at)
     height = np.einsum("qa,qa->q", other.functions(eta), its[place, :, -1])
     height -= np.einsum("qa,qa->q", shape.functions(xi), own[place, :, -1])
