@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import ufl
@@ -96,7 +96,7 @@ class UnitedProblem(given.Sealed):
         MissingBackendError: if ``petsc_options`` name a library that PETSc was built without.
     """
 
-    SETTABLE = {"load": check_load} | checks.NEWTON
+    SETTABLE: ClassVar = {"load": check_load, **checks.NEWTON}
 
     @end_together(lambda self, F, u, **options: u.function_space.mesh.comm if isinstance(u, fem.Function) else None)
     def __init__(
