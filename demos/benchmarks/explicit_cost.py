@@ -84,10 +84,14 @@ def cost(law: str, cell: str, n: int, contactors: str = "massless") -> dict[str,
         with collectives.traffic() as stages:
             next(steps)
         sent = dict(zip(collectives.KINDS, map(int, sum(stages.values(), np.zeros(len(collectives.KINDS), np.int64)))))
-    of_residual, of_step = np.median(comm.allgather(times), axis=1).max(axis=0)
+    every = np.array(comm.allgather(times))
+    of_residual, of_step = np.median(every, axis=1).max(axis=0)
+    # strains of cells are looked at every few steps, which a median leaves out
+    mean = every.mean(axis=1).max(axis=0)[1]
     return {
         "law": law, "cell": cell, "contactors": contactors, "ranks": comm.size, "unknowns": 3 * V.dofmap.index_map.size_global,
         "residual": float(of_residual), "step": float(of_step), "over_residual": float(of_step / of_residual),
+        "mean_over_residual": float(mean / of_residual),
         "contact_share": max(comm.allgather(within / passed)), "calls": int(np.median(calls)), "mean_calls": float(np.mean(calls)),
         "cells": comm.allgather(s.mesh.topology.index_map(3).size_local), "sent": comm.allgather(sent),
     }  # fmt: skip
@@ -115,7 +119,7 @@ if __name__ == "__main__":
         p["speed_up"] = alone.get((p["law"], p["cell"], p["contactors"], p["unknowns"]), np.nan) / p["step"]
         print(
             f"{p['law']:9} {p['cell']:12} {p['contactors']:9} {p['unknowns']:8d} unknowns, {p['ranks']} ranks: {1e3 * p['step']:.3g} ms, "
-            f"{p['over_residual']:.2f} x residual, contact {p['contact_share']:.0%}, "
+            f"{p['over_residual']:.2f} x residual ({p['mean_over_residual']:.2f} in the mean), contact {p['contact_share']:.0%}, "
             f"{p['calls']} calls ({p['mean_calls']:.0f} in the mean), {1e-9 * p['bandwidth']:.3g} GB/s, speed-up {p['speed_up']:.2f}, "
             f"cells {p['cells']}, messages {[sent.get('messages', 0) for sent in p['sent']]}"
         )

@@ -77,6 +77,8 @@ STEADY_STRAIN = 0.1
 #: A run ends where the least height of all cells falls below this part of the mesh's least one: cells collapse, and steps with them.
 #: [convention; the least height; test_explicit_materials.py::test_cells_that_collapse]
 COLLAPSED = 1e-3
+#: Cells whose strains are found at once, in arrays that caches hold. [bound; cells; -]
+AT_ONCE = 4096
 #: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from. [format; wave numbers; -]
 IRRATIONAL = 1e3 * np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
 
@@ -118,8 +120,11 @@ class ExplicitStepper:
         self._derivatives = forms.create_lagrange_element(cell, 1).tabulate(1, points)[1:, :, :, 0]
         #: Least height of the cells, and the fastest rate of strain, as last looked at.
         self.shortest, self.rate = np.inf, 0.0
-        self._of_mesh = self._slopes(config.X)
-        self._least = COLLAPSED * self._height(_inverse(self._of_mesh))
+        #: Cells that are treated at once, and their slopes in the mesh as it was read.
+        self._blocks = [slice(k, k + AT_ONCE) for k in range(0, len(self._vertices), AT_ONCE)]
+        self._of_mesh = [self._slopes(config.X, cells) for cells in self._blocks]
+        steepest = max((_steepest(_inverse(of)) for of in self._of_mesh), default=0.0)
+        self._least = COLLAPSED / float(reduced(problem.comm, steepest, op=MPI.MAX))
         self.sudden = False  # whether accelerations may have strained cells much in the last step
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
 
@@ -211,8 +216,8 @@ class ExplicitStepper:
             largest = float(reduced(problem.comm, float(np.abs(a).max(initial=0.0)), op=MPI.MAX))
             self.sudden = 2.0 * largest * dt**2 > CHECKED_STRAIN * self.shortest
             if self.sudden:
-                inverse = _inverse(self._slopes(config.x))
-                changed = self._strain(inverse, self._slopes(config.X + config.of(problem.committed))) > CHECKED_STRAIN
+                strain = _strain(_inverse(self._slopes(config.x)), self._slopes(config.X + config.of(problem.committed)))
+                changed = float(reduced(problem.comm, strain, op=MPI.MAX)) > CHECKED_STRAIN
         if not changed and self.pattern() == before:
             return
         critical = self.critical_step()
@@ -255,29 +260,14 @@ class ExplicitStepper:
         control.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
         return condensed if stiff else fixed
 
-    def _slopes(self, of: Array) -> Array:
+    def _nodal(self, of: Any) -> Array:
+        """Values of a field at nodes ``(n_local, gdim)``."""
+        return np.asarray(of.x.array.reshape(-1, self.problem.config.gdim))
+
+    def _slopes(self, of: Array, cells: slice = slice(None)) -> Array:
         """Derivatives of nodal values ``(n_local, gdim)`` by reference coordinates, at the points of cells ``(tdim, gdim, n)``."""
-        found = np.tensordot(self._derivatives, of.T[:, self._vertices], (2, 2)).transpose(0, 2, 1, 3)
+        found = np.tensordot(self._derivatives, of.T[:, self._vertices[cells]], (2, 2)).transpose(0, 2, 1, 3)
         return np.asarray(found.reshape(*found.shape[:2], -1))
-
-    def _height(self, inverse: Array) -> float:
-        """Least height of the cells, from the inverse ``_slopes`` of positions (collective)."""
-        steepest = float(np.sqrt(np.square(inverse).sum(axis=0).max(initial=0.0)))
-        return 1.0 / float(reduced(self.problem.comm, steepest, op=MPI.MAX))
-
-    def _strain(self, inverse: Array, since: Array) -> float:
-        """Largest of Almansi's strains, from the inverse ``_slopes`` of positions and the earlier ``_slopes`` (collective)."""
-        back = np.einsum("itn,tjn->ijn", inverse, since)
-        E = 0.5 * (np.eye(len(back))[:, :, None] - np.einsum("ikn,jkn->ijn", back, back))
-        strain = float(np.sqrt(np.einsum("ijn,ijn->n", E, E).max(initial=0.0)))
-        return float(reduced(self.problem.comm, strain, op=MPI.MAX))
-
-    def _rates(self, of: Any, inverse: Array) -> Array:
-        """Rates of strain of a nodal field of rates, from the inverse ``_slopes`` of positions ``(n,)``."""
-        L = np.einsum("itn,tjn->ijn", inverse, self._slopes(of.x.array.reshape(-1, len(inverse))))
-        # turning does not strain
-        D = 0.5 * (L + L.transpose(1, 0, 2))
-        return np.sqrt(np.einsum("ijn,ijn->n", D, D))
 
     def look(self, stretch: float = np.inf) -> float:
         """Find how fast the velocities strain cells, and their least height (collective).
@@ -291,10 +281,13 @@ class ExplicitStepper:
         Raises:
             InvertedElementError: if the height is a small part of the least one of the mesh.
         """
-        inverse = _inverse(self._slopes(self.problem.config.x))
-        rate = float(self._rates(self.dynamics.velocity, inverse).max(initial=0.0))
-        self.rate = float(reduced(self.problem.comm, rate, op=MPI.MAX))
-        self.shortest, strain = self._height(inverse), self._strain(inverse, self._of_mesh)
+        x, v, worst = self.problem.config.x, self._nodal(self.dynamics.velocity), np.zeros(3)
+        for cells, of_mesh in zip(self._blocks, self._of_mesh):
+            inverse = _inverse(self._slopes(x, cells))
+            found = _rates(inverse, self._slopes(v, cells)).max(), _steepest(inverse), _strain(inverse, of_mesh)
+            worst = np.maximum(worst, found)
+        self.rate, steepest, strain = map(float, reduced(self.problem.comm, worst, op=MPI.MAX))
+        self.shortest = 1.0 / steepest
         if self.shortest < self._least:
             raise InvertedElementError(
                 f"cells collapse: their least height, {self._least / COLLAPSED:.3g} at the start, is {self.shortest:.3g}; "
@@ -317,7 +310,7 @@ class ExplicitStepper:
         if self.problem.bodies.linear or not np.isfinite(critical):
             return np.inf
         inverse = _inverse(self._slopes(self.problem.config.x))
-        v, a = (self._rates(of, inverse) for of in (dynamics.velocity, dynamics.acceleration))
+        v, a = (_rates(inverse, self._slopes(of)) for of in (self._nodal(dynamics.velocity), self._nodal(dynamics.acceleration)))
         rates = np.hypot(v, 0.5 * critical * a)
         fastest = float(reduced(self.problem.comm, float(rates.max(initial=0.0)), op=MPI.MAX))
         return STEADY_STRAIN / fastest if fastest > 0.0 else np.inf
@@ -342,6 +335,26 @@ class ExplicitStepper:
         dq, _ = solver.solve(-P.transpose(self._times_K(du)), 0.0)
         du.axpy(1.0, P.expand(solver.complete(dq)))
         return np.array(P.pass_on(self._times_K(du)).array_r) * self.moving
+
+
+def _steepest(inverse: Array) -> float:
+    """One over the least height of cells, from the inverse ``_slopes`` of positions."""
+    return float(np.sqrt(np.square(inverse).sum(axis=0).max(initial=0.0)))
+
+
+def _strain(inverse: Array, since: Array) -> float:
+    """Largest of Almansi's strains, from the inverse ``_slopes`` of positions and the earlier ``_slopes``."""
+    back = np.einsum("itn,tjn->ijn", inverse, since)
+    E = 0.5 * (np.eye(len(back))[:, :, None] - np.einsum("ikn,jkn->ijn", back, back))
+    return float(np.sqrt(np.einsum("ijn,ijn->n", E, E).max(initial=0.0)))
+
+
+def _rates(inverse: Array, of: Array) -> Array:
+    """Rates of strain ``(n,)`` from the inverse ``_slopes`` of positions and the ``_slopes`` of nodal rates."""
+    L = np.einsum("itn,tjn->ijn", inverse, of)
+    # turning does not strain
+    D = 0.5 * (L + L.transpose(1, 0, 2))
+    return np.sqrt(np.einsum("ijn,ijn->n", D, D))
 
 
 def _inverse(A: Array) -> Array:
