@@ -183,6 +183,18 @@ def test_nan_in_the_residual():
     assert not b.u.x.array.any()
 
 
+def test_nan_in_the_displacement():
+    """A start that is not finite on one rank is named on all; with another start the problem is solved."""
+    b = blocks(COMM, "triangle", 2, 4)
+    problem = problem_of(b, uem.Contact(b.high, b.low), bcs=b.oedometer(0.01))
+    if COMM.rank == COMM.size - 1:
+        b.u.x.array[0] = np.nan
+    raised(uem.NotFiniteError, "before the step", problem.solve)
+    b.u.x.array[:] = 0.0
+    problem.solve()
+    assert np.isfinite(b.u.x.array).all() and problem.contacts[0].n_active > 0
+
+
 def test_residual_that_becomes_infinite():
     """A load that is defined up to a displacement only: cut, in the end refused, and the last good state kept."""
     b = blocks(COMM, "triangle", 2, 4)

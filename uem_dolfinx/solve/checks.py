@@ -205,7 +205,7 @@ def check_values(problem: Any, wanted: Array) -> None:
         wanted: all unknowns with their Dirichlet values, ghosts included ``(n,)``.
 
     Raises:
-        NotFiniteError: for a Dirichlet value that is not finite, with its condition, value and position.
+        NotFiniteError: for an unknown or a Dirichlet value that is not finite, with its condition, value and position.
         InputError: if Constants and numbers in the residual, Dirichlet conditions, points, couplings or equations differ between ranks,
             with the first of them and two ranks.
     """
@@ -237,6 +237,12 @@ def _check_finite(config: Configuration, bcs: Sequence[Any], wanted: Array) -> N
                 f"the Dirichlet condition bcs[{i}] prescribes {wanted[bad[0]]} in {config.place_of(int(bad[0]))}: "
                 "expected finite values; check its value and what the load sets"
             )
+    u = config.whole.x.array
+    if len(bad := np.flatnonzero(~np.isfinite(u))):
+        raise NotFiniteError(
+            f"'{config.whole.name}' is {u[bad[0]]} in {config.place_of(int(bad[0]))} before the step: "
+            "expected finite values; set what the step begins with, as u.x.array[:] = 0.0"
+        )
 
 
 def _warn_of_two_values(config: Configuration, bcs: Sequence[Any], wanted: Array) -> None:
