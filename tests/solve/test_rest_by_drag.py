@@ -43,7 +43,7 @@ def centre(problem, contact, size):
     "cell, degree, n_low, how",
     [
         ("triangle", 2, 4, {}), ("quadrilateral", 1, 4, {}), ("triangle", 1, 5, {}), ("triangle", 2, 5, {}),
-        ("triangle", 1, 5, {"coupling": "mortar"}), ("quadrilateral", 2, 4, {"normals": "averaged"}), ("quadrilateral", 2, 5, {}),
+        ("triangle", 1, 5, {"coupling": "mortar"}), ("quadrilateral", 2, 5, {}),
     ],
 )  # fmt: skip
 def test_a_block_rests_in_a_polygonal_bowl(cell, degree, n_low, how):

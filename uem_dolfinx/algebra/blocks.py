@@ -1,4 +1,4 @@
-"""Sparse matrices with arrays shared by NumPy and PETSc, or as lists of nodal blocks by global numbers."""
+"""Sparse matrices with arrays shared by NumPy and PETSc, or as lists of nodal blocks by global numbers, multiplied by SciPy."""
 
 from __future__ import annotations
 
@@ -39,9 +39,33 @@ def together(*parts: Blocks) -> Blocks:
 
 def product(A: Blocks, B: Blocks) -> Blocks:
     """``A B`` without duplicates, zeros stored; columns of A without a row in B count as zero."""
-    places, counts = places_of(B, A.column)
-    i = np.repeat(np.arange(len(counts)), counts)
-    return summed(Blocks(A.row[i], B.column[places], A.value[i] @ B.value[places]))
+    from scipy.sparse import bsr_matrix
+
+    g = A.value.shape[1]
+    inner, of_inner = np.unique(B.row, return_inverse=True)
+    at = inner.searchsorted(A.column)
+    kept = np.append(inner, -1)[at] == A.column
+    rows, of_row = np.unique(A.row[kept], return_inverse=True)
+    columns, of_column = np.unique(B.column, return_inverse=True)
+    if not len(rows):
+        return Blocks(rows, rows, np.zeros((0, g, g)))
+    # for blocks of single numbers SciPy drops zeros, so that the sparsity would depend on values
+    wide = np.zeros((len(B.row), g, max(g, 2)))
+    wide[:, :, :g] = B.value
+    left = in_rows(of_row, at[kept], A.value[kept], len(rows))
+    right = in_rows(of_inner, of_column, wide, len(inner))
+    C = bsr_matrix(left, shape=(g * len(rows), g * len(inner))) @ bsr_matrix(
+        right, shape=(g * len(inner), wide.shape[2] * len(columns))
+    )
+    return Blocks(np.repeat(rows, np.diff(C.indptr)), columns[C.indices], C.data[:, :, :g])
+
+
+def in_rows(row: Ints, column: Ints, value: Array, n_rows: int) -> tuple[Array, Ints, Ints]:
+    """Blocks in the order of their rows, their columns, and the start of each row."""
+    order = row.argsort(kind="stable")
+    starts = np.zeros(n_rows + 1, dtype=np.int64)
+    np.bincount(row, minlength=n_rows).cumsum(out=starts[1:])
+    return value[order], column[order], starts
 
 
 def summed(A: Blocks) -> Blocks:

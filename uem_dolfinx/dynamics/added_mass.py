@@ -153,6 +153,15 @@ class AddedMass:
         at = self._placement
         return self.motions(at) @ self.set.motion_of(at, rates)
 
+    def nodal_velocities(self) -> Array:
+        """Velocities of the owned nodes of the set that follow point and axes ``(n, gdim)`` (collective)."""
+        at, V, g = self._placement, self.motions(self._placement), len(self._point)
+        # rows and columns of one unit
+        rows, columns = 1.0 / self._as_forces, np.append(np.ones(g), np.full(V.shape[2] - g, 1.0 / self.set.radius))
+        scaled = V * rows[:, :, None] * columns
+        rates, *_ = np.linalg.lstsq(scaled.reshape(-1, V.shape[2]), (rows * self.velocity).ravel(), rcond=None)
+        return np.asarray(velocities(at.arms(self.set.X)) @ (columns * rates))
+
     def begin(self, scheme: Scheme | CentralDifferences, dt: float) -> None:
         """Begin a step."""
         self._step = scheme, *scheme.ending(self.velocity, self.acceleration, dt)

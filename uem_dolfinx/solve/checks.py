@@ -238,9 +238,10 @@ def _check_finite(config: Configuration, bcs: Sequence[Any], wanted: Array) -> N
                 "expected finite values; check its value and what the load sets"
             )
     u = config.whole.x.array
-    if len(bad := np.flatnonzero(~np.isfinite(u))):
+    if not np.isfinite(u).all():
+        first = int(np.flatnonzero(~np.isfinite(u))[0])
         raise NotFiniteError(
-            f"'{config.whole.name}' is {u[bad[0]]} in {config.place_of(int(bad[0]))} before the step: "
+            f"'{config.whole.name}' is {u[first]} in {config.place_of(first)} before the step: "
             "expected finite values; set what the step begins with, as u.x.array[:] = 0.0"
         )
 

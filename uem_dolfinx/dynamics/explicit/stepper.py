@@ -78,7 +78,7 @@ STEADY_STRAIN = 0.1
 #: [convention; the least height; test_explicit_materials.py::test_cells_that_collapse]
 COLLAPSED = 1e-3
 #: Cells whose strains are found at once, in arrays that caches hold. [bound; cells; -]
-AT_ONCE = 4096
+CELLS_AT_ONCE = 4096
 #: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from. [format; wave numbers; -]
 IRRATIONAL = 1e3 * np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
 
@@ -121,7 +121,7 @@ class ExplicitStepper:
         #: Least height of the cells, and the fastest rate of strain, as last looked at.
         self.shortest, self.rate = np.inf, 0.0
         #: Cells that are treated at once, and their slopes in the mesh as it was read.
-        self._blocks = [slice(k, k + AT_ONCE) for k in range(0, len(self._vertices), AT_ONCE)]
+        self._blocks = [slice(k, k + CELLS_AT_ONCE) for k in range(0, len(self._vertices), CELLS_AT_ONCE)]
         self._of_mesh = [self._slopes(config.X, cells) for cells in self._blocks]
         steepest = max((_steepest(_inverse(of)) for of in self._of_mesh), default=0.0)
         self._least = COLLAPSED / float(reduced(problem.comm, steepest, op=MPI.MAX))

@@ -27,9 +27,8 @@ from uem_dolfinx.parallel import reduced
 
 #: All loads move a body against the first drag by this part of its radius. [bound; radius; -]
 FIRST_WAY = 0.3
-#: The drag of the next step over that of the last one; after a failed step it grows by as much.
-#: [convention; drag; test_rest_by_drag.py::test_a_block_rests_in_a_polygonal_bowl]
-DECAY = 0.3
+#: The drag of the next step over that of the last one; after a failed step it grows by as much. [bound; drag; -]
+DECAY = 0.03
 #: Steps in all, and steps that fail among them. [bound; steps; -]
 MOST_DRAGGED, MOST_FAILED = 40, 6
 

@@ -170,7 +170,7 @@ class Exchanges:
             return None
         if climbs and not self.straight:
             # far from equilibrium bodies may jump by an exchange that is none there: the last states without a jump are kept
-            self._stays = self._before is not None and not self.frictional and self._norm <= WHOLE_AGAIN * self._stayed
+            self._stays = self.softens and self._before is not None and self._norm <= WHOLE_AGAIN * self._stayed
             if self._stays and self._before is not None:
                 self._stayed = self._norm if self._visits else np.inf
                 for pair, before in zip(self._pairs, self._before):

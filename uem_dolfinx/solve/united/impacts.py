@@ -122,11 +122,11 @@ class Impacts:
         dynamics = self.dynamics
         part, shape, n = dynamics.scheme.lasting, dynamics.massy.shape, dynamics.massy.size
         found = united_accelerations(dynamics.matrix, self._rows().test, forces, added_mass(self._problem.linear, forces))
-        a = found.array_r[:n].reshape(shape) * dynamics.massy
+        a = found.array_r[:n].reshape(shape)
         now, own = (np.array(field.x.array[:n]) for field in (dynamics.velocity, dynamics.acceleration))
-        dynamics.change_rates(now, own - part * a.ravel(), part)
+        dynamics.change_rates(now, own - part * (a * dynamics.massy).ravel(), part)
         inertia = self._problem.config.unknowns.vector()
-        inertia.array[:n] = dynamics.mass.times(a).ravel()
+        inertia.array[:n] = dynamics.mass.times(a * dynamics.massy).ravel()
         for one in dynamics.added:
             inertia.array[:n].reshape(shape)[one.set.nodes] += one.take_out(a, part)
         return inertia
@@ -151,9 +151,10 @@ class Impacts:
             now = rows.with_gaps(problem.system.over_constraints, gap, on)
             c = now.frictionless.c
             dv = c + united_accelerations(M, now.frictionless, -forms.product(M, c, more), more, now.test)
-            change, total = dv.array_r[:n].reshape(shape) * dynamics.massy, forces.copy()
+            every, total = dv.array_r[:n].reshape(shape), forces.copy()
+            change = every * dynamics.massy
             impulse = dynamics.mass.times(change)
-            of_points = [(one, one.carried_by(change)) for one in dynamics.added]
+            of_points = [(one, one.carried_by(every)) for one in dynamics.added]
             total.array[:n] += impulse.ravel() / dynamics.last
             for one, own in of_points:
                 total.array[:n].reshape(shape)[one.set.nodes] += one.nodal_forces(one.masses[:, None] * own) / dynamics.last
@@ -166,7 +167,8 @@ class Impacts:
         self.excess = np.array([(impulse * v)[held].sum(), (impulse * rates)[~held].sum()])
         for one, own in of_points:
             # the same on all ranks
-            self.excess[1] += one.masses @ (own * one.carried_by(rates)).sum(axis=1) / problem.comm.size
+            lead = one.velocity + 0.5 * own - one.carried_by(mean)
+            self.excess[1] += one.masses @ (own * lead).sum(axis=1) / problem.comm.size
             one.change_rates(one.velocity + own, one.acceleration)
         dynamics.change_rates((v + change).ravel(), np.array(dynamics.acceleration.x.array[:n]))
         for pair, force in zip(pairs, found):
@@ -179,7 +181,11 @@ class Impacts:
         """Rates of the gaps of all equations ``(m,)``, relative to the mean motions of rigid targets over the step (collective)."""
         config, eq, n = self._problem.config, rows.whole.rows, self.dynamics.massy.size
         (every := config.unknowns.vector()).array[:n] = self.dynamics.velocity.x.array[:n]
-        v = every.array_r.reshape(-1, config.gdim)
+        v = every.array.reshape(-1, config.gdim)
+        # nodes without mass of their own move with that at the point of their coupling
+        for one in self.dynamics.added:
+            nodes = one.set.nodes
+            v[nodes] = np.where(self.dynamics.massy[nodes], v[nodes], one.nodal_velocities())
         theirs, at, first = np.einsum("kg,kg->k", eq.coefficients, config.unknowns.ask_owners(eq.followed, v)), v[eq.node], 0
         before, still = dict(zip(self._problem.interfaces, self._problem.motions)), Motion.none(config.gdim)
         for pair, part in zip(rows.pairs, rows.equations):
