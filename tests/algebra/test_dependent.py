@@ -6,8 +6,6 @@ the equations that replace contested ones with dense linear algebra.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 from mpi4py import MPI
 
 import numpy as np
@@ -19,7 +17,7 @@ from hypothesis import strategies as st
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
-from uem_dolfinx.algebra.dependent import IndependentEquations, Rank, _eliminate, _solve, least_squares
+from uem_dolfinx.algebra.dependent import IndependentEquations, Rank, _eliminate, least_squares
 from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.geometry.configuration import Configuration
@@ -396,27 +394,6 @@ def test_contactor_of_two_pairs(overlap):
     exact = -0.005 * (x[:, 1] + 1)
     assert highest(COMM, np.abs(problem.config.displacement[:, 1] - exact)) < 1e-14
     assert sum(c.resultant().force[1] for c in contacts) == pytest.approx(2 * 0.005 * M, rel=1e-10)
-
-
-@pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
-@pytest.mark.parametrize(("past", "left_out"), [(2e-7, 1), (1e-8, 1), (-6e-7, 0)])
-def test_rows_past_an_end_are_left_out_first(past, left_out, size):
-    """Two corners that meet: one lies on the other's facet, the other past its end by ``past`` of it or before it.
-
-    Both equations nearly say the same; the one of the corner on a facet is kept, the other left out. Elsewhere the first is.
-    """
-    a, b = np.array([-0.227, 0.974]), np.array([0.2270002, -0.9739998])
-    normals = np.array([a / np.linalg.norm(a), b / np.linalg.norm(b)])
-    # nodes 0 and 1 are the corners, 2 and 3 the other ends of their facets
-    followed = np.array([1, 3, 0, 2])
-    weights = np.array([1.0 - 3e-7, 3e-7, 1.0 + past, -past])
-    equations = UnitingEquations(
-        node=np.array([0, 1], dtype=np.int32), direction=normals, gap=size * np.array([1e-6, 0.0]), active=np.ones(2, bool),
-        row=np.array([0, 0, 1, 1]), followed=followed, coefficients=weights[:, None] * normals[[0, 0, 1, 1]],
-    )  # fmt: skip
-    space = SimpleNamespace(block=2, ask_owners=lambda node, values: values[node])
-    (group,) = _solve(space, equations, np.ones((4, 2), bool), *np.zeros((3, 2), bool))
-    assert list(group.redundant) == [left_out == 0, left_out == 1]
 
 
 @pytest.mark.parametrize("in_cone", [True, False])

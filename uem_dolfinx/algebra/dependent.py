@@ -40,7 +40,7 @@ def least_squares(E: Array, e: Array, quick: bool = True) -> Array:
 
 
 #: A weight that exceeds one by more extrapolates: the contactor is past an end of the target.
-#: [bound; weight; test_dependent.py::test_rows_past_an_end_are_left_out_first]
+#: [bound; weight; test_equations.py::test_rows_past_an_end_are_left_out_first]
 EXTRAPOLATED = 1e-9
 
 
