@@ -64,8 +64,9 @@ class Rule:
                 array if array.shape == shape else np.broadcast_to(array.reshape((*array.shape, *(1,) * (size > 1))[:2]), shape)
             )
         except (TypeError, ValueError):
+            kind = "complex numbers of the shape" if np.iscomplexobj(found) else "the shape"
             raise InputError(
-                f"{self._words} has the shape {np.shape(found)} at {n} places x of the shape (3, {n}): expected {shape}; "
+                f"{self._words} has {kind} {np.shape(found)} at {n} places x of the shape (3, {n}): expected {shape}; "
                 "a load factor or time is the second argument, f(x, s)"
             ) from None
         self.values.x.array.reshape(-1, size)[self._dofs] = array.T.reshape(-1, size)

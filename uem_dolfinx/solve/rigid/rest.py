@@ -28,7 +28,7 @@ from uem_dolfinx.parallel import reduced
 #: All loads move a body against the first drag by this part of its radius. [bound; radius; -]
 FIRST_WAY = 0.3
 #: The drag of the next step over that of the last one; after a failed step it grows by as much. [bound; drag; -]
-DECAY = 0.03
+DECAY = 0.3
 #: Steps in all, and steps that fail among them. [bound; steps; -]
 MOST_DRAGGED, MOST_FAILED = 40, 6
 
