@@ -276,7 +276,7 @@ def test_a_guyed_arm(cell):
     tension = 0.5 * (spring.length - 2.0)
     assert np.allclose(spring.force, -tension * D / spring.length, atol=1e-12)
     load = r.vector(0.05, -0.4)
-    turning = np.cross((end - o)[:2], spring.force[:2]) + np.cross(middle[:2], load[:2])
+    turning = np.linalg.det([(end - o)[:2], spring.force[:2]]) + np.linalg.det([middle[:2], load[:2]])
     assert abs(turning) <= 1e-11 and abs(hinge.angle) > 0.1
     assert np.allclose(hinge.force, -spring.force - load, atol=1e-10)
     assert quadratic(iterations)
