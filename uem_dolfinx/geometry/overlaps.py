@@ -125,13 +125,12 @@ def overlap(planes: Planes, contactor: Facets, target: Facets, sign: Array, face
     pair = np.flatnonzero(((low[facet] < most) & (least < high[facet]))[:, :-1].all(axis=1))
     planes, own, its, sign = planes.take(facet[pair]), own[facet[pair]], its[pair], sign[facet[pair]]
     # each pair has the rule of its own facets, whatever other pairs this rank has
-    straight, cut, parts = _straight(shape, own[:, :, :-1]) & _straight(other, its[:, :, :-1]), _polygons, []
-    if shape.dim == 1:
-        cut = _intervals
+    straight, parts = _straight(shape, own[:, :, :-1]) & _straight(other, its[:, :, :-1]), []
+    cut = _intervals if shape.dim == 1 else _polygons
     for kind in np.unique(straight) if len(straight) else (True,):
         which = np.flatnonzero(straight == kind)
-        some = planes.take(which), (shape, own[which]), (other, its[which]), sign[which], quadrature(shape, kind)
-        place, at, weight = cut(*some)
+        rule = quadrature(shape, kind)
+        place, at, weight = cut(planes.take(which), (shape, own[which]), (other, its[which]), sign[which], rule)
         parts.append((which[place], at, weight))
     place, at, weight = (np.concatenate(part) for part in zip(*parts))
     order = np.argsort(place, kind="stable")
