@@ -6,7 +6,9 @@ the bodies are on.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -113,15 +115,21 @@ def two_bars(stiffer: float, heavier: float, contactors: str, trial: Trial) -> N
     start = forms.assemble_scalar(forms.form(RHO * dynamics.velocity[1] * scene.part(0)), COMM)
     impedance = np.sqrt(stiffer * heavier)
     force, impulses = RHO * C * V0 * impedance / (1 + impedance) * H, []
+    for since in pressed(problem, trial, scene, motion, gap):
+        impulses.append((forms.assemble_scalar(upper, COMM) - start) / (force * since))
+    trial.check("impulse", np.mean(impulses) - 1, WAVES)
+
+
+def pressed(problem: Any, trial: Trial, scene: BoxScene, motion: Motion, gap: float) -> Iterator[float]:
+    """Times since bars met across a gap, after the wave has passed one; overlap and energy are checked every few steps."""
     for step in uem.time_steps(problem, end=gap / V0 + 1.8 / C):
         trial.iterations += step.newton_iterations
         since = step.time - gap / V0
         if step.number % LOOK == 0:
             trial.check("overlap", overlap(scene, H), OVERLAP)
-            trial.check("energy gained", max(0.0, gained(motion, dynamics, step.dt)), FORCE)
+            trial.check("energy gained", max(0.0, gained(motion, problem.dynamics, step.dt)), FORCE)
             if since > 1.0 / C:
-                impulses.append((forms.assemble_scalar(upper, COMM) - start) / (force * since))
-    trial.check("impulse", np.mean(impulses) - 1, WAVES)
+                yield since
 
 
 def onto_block(stiffer: float, cell: str, wide: float, contactors: str, trial: Trial) -> None:
@@ -151,15 +159,9 @@ def onto_block(stiffer: float, cell: str, wide: float, contactors: str, trial: T
     block = forms.form(RHO * dynamics.mean_velocity[g - 1] * scene.part(1))
     # the force falls with the speed of the bar relative to the block
     mass, rate, impulses = RHO * wide**g, C * H ** (g - 1) / wide**g, []
-    for step in uem.time_steps(problem, end=gap / V0 + 1.8 / C):
-        trial.iterations += step.newton_iterations
-        since = step.time - gap / V0
-        if step.number % LOOK == 0:
-            trial.check("overlap", overlap(scene, H), OVERLAP)
-            trial.check("energy gained", max(0.0, gained(motion, dynamics, step.dt)), FORCE)
-            if since > 1.0 / C:
-                expected = -mass * V0 * (1.0 - np.exp(-rate * since))
-                impulses.append(forms.assemble_scalar(block, COMM) / expected)
+    for since in pressed(problem, trial, scene, motion, gap):
+        expected = -mass * V0 * (1.0 - np.exp(-rate * since))
+        impulses.append(forms.assemble_scalar(block, COMM) / expected)
     trial.check("impulse", np.mean(impulses) - 1, WAVES)
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 #: [convention; slope; test_tabulated_back_stress.py::test_points_on_a_straight_line]
 SAME_SLOPE = 1e-9
 #: Components in the plane, of those in plane strain. [format; components; -]
-PLANE = [0, 1, 3]
+OF_PLANE = [0, 1, 3]
 
 
 @dataclass(frozen=True)
@@ -165,12 +165,12 @@ class Layers:
         full, each, stiff, converged = self._free_across(strain, plastic_strain, peeq, mu, bulk)
         pressure, c, m = bulk * full[:, :3].sum(axis=1), each.c + bulk, each.m.reshape(len(full), self.count, 4)
         one = np.array([1.0, 1.0, 0.0])
-        stress = each.stress[:, PLANE] + pressure[:, None] * one
+        stress = each.stress[:, OF_PLANE] + pressure[:, None] * one
         stress[~converged] = np.nan
         # condensation of the out-of-plane strain: derivative of the stress in the plane by it
-        mixed = c[:, None] * one - np.einsum("nj,njk->nk", m[:, :, 2], m[:, :, PLANE])
+        mixed = c[:, None] * one - np.einsum("nj,njk->nk", m[:, :, 2], m[:, :, OF_PLANE])
         last = mixed / np.sqrt(stiff)[:, None]
-        vectors = np.concatenate([m[:, :, PLANE].reshape(len(full), 3 * self.count), last], axis=1)
+        vectors = np.concatenate([m[:, :, OF_PLANE].reshape(len(full), 3 * self.count), last], axis=1)
         return Returned(stress, each.plastic_strain, each.peeq, each.a, c, vectors, each.energy + pressure**2 / (2 * bulk))
 
     def _free_across(
@@ -216,4 +216,4 @@ class Layers:
         # the bulk modulus is 2 area shear / 3 (3 shear - area)
         of_bulk, area, shear = pressed * full[:, :3].sum(axis=1), E / (1 - nu), E / (1 + nu)
         part = of_bulk / (3 * shear - area)
-        return replace(by, strain=by.strain[:, PLANE], shear=by.shear - area * part, area=3 * shear * part)
+        return replace(by, strain=by.strain[:, OF_PLANE], shear=by.shear - area * part, area=3 * shear * part)
