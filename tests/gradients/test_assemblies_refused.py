@@ -13,10 +13,14 @@ def after(s, **how):
     return {"contacts": [uem.Contact(s.b.high, s.b.low, tied="after")]}
 
 
+def held(s, **how):
+    return {"contacts": [*tie(s)["contacts"], uem.Contact(s.b.bottom, uem.RigidPlane((0.5, -1.0), (0.0, 1.0)), tied=True)]}
+
+
 #: What is refused: feature, options, control, words of the refusal, and whether it is one of a history.
 REFUSED = {
     "ties made later": (after, {}, "E", "tied between steps", True),
-    "the shape, ties by mortar": (tie, {"coupling": "mortar"}, "X", "ties by mortar", False),
+    "the shape, ties to rigid surfaces": (held, {}, "X", "ties to rigid surfaces", False),
     "the shape, ties of hexahedra": (tie, {"cell": "hexahedron", "sizes": (2, 3)}, "X", "ties of hexahedra", False),
     "the shape, a section without axis": (preload, {}, "X", "expected an axis", False),
     "the shape, mean motions": (mean, {}, "X", "with a MeanMotion", False),
@@ -48,7 +52,7 @@ def test_refused(what, monkeypatch):
 
 #: What is refused before the first step of a history, by the derivatives that are announced.
 ANNOUNCED = {
-    "the shape, ties by mortar": (tie, {"coupling": "mortar"}, False, lambda s: {"controls": s.X}, "ties by mortar"),
+    "the shape, ties of hexahedra": (tie, {"cell": "hexahedron"}, False, lambda s: {"controls": s.X}, "ties of hexahedra"),
     "the shape, equations of rigid parts": (relation, {}, False, lambda s: {"controls": [s.E, s.X]}, "with couplings"),
     "the shape in time": (tie, {}, True, lambda s: {"controls": [s.X]}, "no derivatives by it in time"),
     "the displacement": (tie, {}, False, lambda s: {"controls": [s.u]}, "which the problem solves for"),
@@ -69,3 +73,11 @@ def test_announced_and_taken():
     s = assembly(feature=tie)
     s.solve(2, True, controls=[s.E, s.X])
     assert len(s.history.gradient(s.J, [s.E, s.X])) == len(s.history.tangent([(s.E, 1.0)])) == 2
+
+
+def test_facets_covered_in_part():
+    """Means over facets that the target covers in part have no derivatives by the shape; others have."""
+    s = assembly(feature=tie, coupling="mortar", overhang=-0.13)
+    s.solve()
+    refused(uem.InputError, "facets of the contactor in part", lambda: uem.gradient(s.problem, s.J, s.X))
+    assert len(uem.gradient(s.problem, s.J, [s.E])) == 1

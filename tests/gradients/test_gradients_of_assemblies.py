@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import ufl
 from assembly_scenes import EACH, FEATURES, MOTION, NEEDS_HISTORY, assembly, change_of, controls_of, order, preload, scene
-from gradient_scenes import along
+from gradient_scenes import along, move, wave
 from helpers import refused
 
 import uem_dolfinx as uem
@@ -37,6 +37,21 @@ def test_each_of_second_order(what, name):
     """One control after the other."""
     s, _ = scene(what)
     assert order(s, (name,), 2 if what in NEEDS_HISTORY else 1, what in NEEDS_HISTORY) >= 1.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what, error", [("tie by mortar across a gap", 1e-8), ("shortening by mortar", 1e-8)])
+def test_shape_of_means_by_differences(what, error):
+    """By the shape, against central differences of fourth order."""
+    s, _ = scene(what)
+    s.solve()
+    change, x, values = wave(s.b.V, 0.02), s.b.scene.mesh.geometry.x, []
+    slope, places = along(uem.gradient(s.problem, s.J, [s.X]), [change]), np.array(x)
+    for h in (0.05, -0.05, 0.1, -0.1):
+        x[:] = places
+        move(s, change, h)
+        values.append(s.solve())
+    assert slope == pytest.approx((8 * (values[0] - values[1]) - values[2] + values[3]) / 0.6, rel=error)
 
 
 #: What is exact in time, with its own control.

@@ -18,11 +18,15 @@ import uem_dolfinx as uem
 COMM = MPI.COMM_WORLD
 
 
-def assembly(cell="triangle", sizes=(3, 4), feature=None, comm=COMM, top=True, bottom=True, gap=0.0, locked=False, **how):
+def assembly(
+    cell="triangle", sizes=(3, 4), feature=None, comm=COMM, top=True, bottom=True, gap=0.0, locked=False, wavy=0.0, overhang=0.2, **how
+):  # fmt: skip
     """A block on another, joined by a feature, loaded and moved at its top, and the values that its solution depends on."""
     # nodes are apart from sides of facets below, across which closest points have kinks
     shift = np.array([0.03, 0.07, 0.0]) if gap and cell == "tetrahedron" else 0.0
-    b = blocks(comm, cell, *sizes, overhang=0.2, gap=gap, pose=lambda x: x + shift * (x[:, -1:] > 0.5 * gap))
+    b = blocks(comm, cell, *sizes, overhang=overhang, gap=gap, pose=lambda x: x + shift * (x[:, -1:] > 0.5 * gap))
+    X = b.scene.mesh.geometry.x
+    X[:, b.gdim - 1] += wavy * np.sin(4 * X[:, 0] + X[:, 1] * (b.gdim == 3))
     mesh, g, v = b.scene.mesh, b.gdim, ufl.TestFunction(b.V)
     E, load = fem.Constant(mesh, 1.0), fem.Constant(mesh, np.array([0.01, *[0.0] * (g - 2), -0.01]))
     push = fem.Constant(mesh, np.array([0.02, *[0.0] * (g - 2), -0.05]))
@@ -218,22 +222,25 @@ def order(s, names, steps=1, recorded=False, size=0.02, halvings=1):
 
 
 ALL, FREE = ("E", "load", "top", "field"), ("E", "load", "field")
-AXIS = {"axis": (0.1, 1.0)}
+AXIS, TETRAHEDRA = {"axis": (0.1, 1.0)}, {"gap": 0.05, "cell": "tetrahedron", "sizes": (2, 3)}
 LOADS = ("force of the coupling", "moment of the coupling")
 MOTION = ("motion[0]", "motion[1]", "motion[2]")
 #: Feature, its options, controls in addition to those of the bodies, and whether the top is moved by Dirichlet conditions.
 FEATURES = {
     "tie": (tie, {}, (*ALL, "X")),
     "tie across a gap": (tie, {"gap": 0.05}, (*ALL, "X")),
-    "tie of tetrahedra across a gap": (tie, {"gap": 0.05, "cell": "tetrahedron", "sizes": (2, 3)}, (*ALL, "X")),
-    "tie by mortar": (tie, {"coupling": "mortar"}, ALL),
+    "tie of tetrahedra across a gap": (tie, TETRAHEDRA, (*ALL, "X")),
+    "tie by mortar": (tie, {"coupling": "mortar"}, (*ALL, "X")),
+    "tie by mortar across a gap": (tie, {"coupling": "mortar", "gap": 0.05, "wavy": 0.1}, (*ALL, "X")),
+    "tie by mortar of tetrahedra": (tie, {"coupling": "mortar", "wavy": 0.12} | TETRAHEDRA, (*ALL, "X")),
     "tie, friction beside it": (dragged, {}, ("E", "load", "field", "X", "friction", "place")),
     "preload": (preload, AXIS, (*ALL, "force", "X")),
-    "preload by mortar": (preload, {"coupling": "mortar"}, (*ALL, "force")),
+    "preload by mortar": (preload, AXIS | {"coupling": "mortar"}, (*ALL, "force", "X")),
+    "shortening by mortar": (shortening, AXIS | {"coupling": "mortar", "wavy": 0.1}, (*ALL, "shortening", "X")),
     "preload, locked": (preload, AXIS | {"locked": True}, (*ALL, "force")),
     "shortening": (shortening, AXIS, (*ALL, "shortening", "X")),
     "coupling": (coupling, {}, (*FREE, *LOADS, "X")),
-    "coupling, mortar": (coupling, {"contact": {"tied": True, "coupling": "mortar"}}, (*FREE, *LOADS)),
+    "coupling, mortar": (coupling, {"contact": {"tied": True, "coupling": "mortar"}}, (*FREE, *LOADS, "X")),
     "coupling in space": (coupling, {"cell": "tetrahedron", "sizes": (2, 2), "gap": 0.05, "larger": 20}, (*FREE, *LOADS, "X")),
     "coupling, spring": (coupling, {"joints": sprung}, (*FREE, *LOADS, "X")),
     "coupling, spring, small rotations": (coupling, {"joints": sprung, "rotations": "small"}, (*FREE, *LOADS, "X")),

@@ -61,7 +61,7 @@ from uem_dolfinx.gradients.parameters import (
     thickened,
     turned_by,
 )
-from uem_dolfinx.gradients.shape_slopes import Followers, RigidSlopes, ShapeSlopes, shape_slopes_of
+from uem_dolfinx.gradients.shape_slopes import Followers, Slopes, shape_slopes_of
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.field_scales import ratio
@@ -335,7 +335,7 @@ class Linearised:
         return Places(self.config)
 
     @cached_property
-    def shape_slopes(self) -> list[tuple[slice, ShapeSlopes | RigidSlopes]]:
+    def shape_slopes(self) -> list[tuple[slice, Slopes]]:
         """Derivatives of ties and users' equations by positions of nodes, each with its equations (first time: collective)."""
         found = shape_slopes_of(self.problem, self.equations)
         if found:

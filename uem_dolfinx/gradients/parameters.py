@@ -296,11 +296,14 @@ def refuse_shape(problem: UnitedProblem) -> None:
             )
         if not contact.tied:
             continue
-        if contact.coupling != "node_to_surface" or not contact.pair.target.n_nodes:
-            raise InputError(
-                f"contact '{contact.name}': there is no gradient by the shape with ties by mortar or to rigid surfaces: expected a tie of "
-                "two bodies with coupling='node_to_surface'"
-            )
+        means = contact.coupling != "node_to_surface"
+        for wrong, what, expected in (
+            (not contact.pair.target.n_nodes, "ties to rigid surfaces", "a tie of two bodies"),
+            (means and problem.config.degree > 1, "ties by mortar of degree 2", "degree 1, or coupling='node_to_surface'"),
+            (means and problem.config.axisymmetric, "ties by mortar in axisymmetry", "coupling='node_to_surface'"),
+        ):
+            if wrong:
+                raise InputError(f"contact '{contact.name}': there is no gradient by the shape with {what}: expected {expected}")
         if problem.config.gdim == 3 and problem.config.mesh.topology.cell_name() == "hexahedron":
             raise InputError(
                 f"contact '{contact.name}': there is no gradient by the shape with ties of hexahedra, whose facets warp: expected "

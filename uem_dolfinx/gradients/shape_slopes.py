@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -36,6 +37,7 @@ from uem_dolfinx.contact.ties.tied_rows import Spacers, foot_below
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import ON_SIDE, MeshTarget
+from uem_dolfinx.gradients.tied_means import closest_slopes, of_means
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -50,6 +52,11 @@ class ShapeSlopes:
     rows: tuple[Ints, Array]  # global nodes ``(m, k)`` and vectors ``(m, k, gdim)`` for the gaps ``(m,)``
     #: global nodes ``(j, l)`` and blocks ``(j, l gdim, l gdim)`` for the residual, from columns to rows.
     forces: tuple[Ints, Array]
+
+    @property
+    def n(self) -> int:
+        """Number of the equations."""
+        return len(self.rows[0])
 
     def along(self, X: Array) -> tuple[Array, Array]:
         """Changes of gaps ``(m,)`` and residual ``(n_owned, gdim)`` along ``X (n_owned, gdim)`` (collective)."""
@@ -93,7 +100,7 @@ def of_tie(tie: Tie, bond: Array) -> ShapeSlopes:
         tab, height = foot_below(target, p.x[i], p.xi[i], X)
         below, drawn = p.nodes[i], p.x[i]
     s = Spacers(config.to_global(own)[:, None], np.ones((len(i), 1, g)), below, tab.dN, height, drawn)
-    xi, up = _foot_slopes(s, tab.N)
+    xi, up = closest_slopes(s, tab.N)
     y = config.ask_owners(below.ravel(), config.x[: config.n_owned]).reshape(drawn.shape)
     length, n, across, slopes = s.turning(y)
     t = np.einsum("kaf,kag->kfg", tab.dN, y)
@@ -110,21 +117,6 @@ def of_tie(tie: Tie, bond: Array) -> ShapeSlopes:
     if isinstance(tie, Preloaded):
         rows = tie.without_lead(*rows)
     return ShapeSlopes(config, rows, (nodes, blocks.reshape(k, width * g, width * g)))
-
-
-def _foot_slopes(s: Spacers, N: Array) -> tuple[Array, Array]:
-    """Derivatives of coordinates ``(k, fdim, (1 + nn) gdim)`` and heights ``(k, (1 + nn) gdim)`` of closest points on straight facets."""
-    _, n, _, _ = s.turning(s.y)
-    k, nn, fdim = s.dN.shape
-    t = np.einsum("kaf,kag->kfg", s.dN, s.y)
-    T = np.zeros((k, fdim, 1 + nn, n.shape[1]))
-    T[:, :, 0] = t
-    T[:, :, 1:] = np.einsum("k,kaf,kg->kfag", s.height, s.dN, n) - np.einsum("ka,kfg->kfag", N, t)
-    m = np.einsum("kfg,keg->kfe", t, t)
-    up = np.concatenate([n[:, None], -N[:, :, None] * n[:, None]], axis=1)
-    # a rank without contactors has no width
-    width = (1 + nn) * n.shape[1]
-    return np.linalg.solve(m, T.reshape(k, fdim, width)), up.reshape(k, width)
 
 
 def warn_of_edges(problem: UnitedProblem) -> None:
@@ -201,13 +193,24 @@ def of_couplings(config: Configuration, users: UserRows) -> list[RigidSlopes]:
     return found
 
 
-def shape_slopes_of(problem: UnitedProblem, equations: Sequence[ContactRows]) -> list[tuple[slice, ShapeSlopes | RigidSlopes]]:
+class Slopes(Protocol):
+    """Derivatives of some equations and of their forces by the positions of nodes; members as of ``ShapeSlopes``."""
+
+    def along(self, X: Array) -> tuple[Array, Array]:
+        """See ``ShapeSlopes``."""
+
+    def back(self, by_gaps: Array, by_residual: Array) -> Array:
+        """See ``ShapeSlopes``."""
+
+
+def shape_slopes_of(problem: UnitedProblem, equations: Sequence[ContactRows]) -> list[tuple[slice, Slopes]]:
     """Of all ties, linear equations and couplings, each with its place among the equations of contacts and users (collective)."""
-    found, first = list[tuple[slice, ShapeSlopes | RigidSlopes]](), 0
+    found, first = list[tuple[slice, Slopes]](), 0
     for pair, own in zip(problem.interfaces, equations):
         if pair.tie is not None and pair.tie.rows is not None and pair.trial.bond is not None:
-            slopes = of_tie(pair.tie, pair.trial.bond)
-            found.append((slice(first + len(own) - len(slopes.rows[0]), first + len(own)), slopes))
+            by_means = pair.tie.means is not None
+            slopes = of_means(pair.tie, pair.trial.bond) if by_means else of_tie(pair.tie, pair.trial.bond)
+            found.append((slice(first + len(own) - slopes.n, first + len(own)), slopes))
         first += len(own)
     if problem.linear is not None and problem.linear.linear is not None:
         linear = problem.linear.linear

@@ -130,6 +130,11 @@ class Preloaded(Tie):
         return True
 
     @property
+    def rows_in_use(self) -> int:
+        """Number of this rank's rows but for the leading one of an opening that is free."""
+        return len(self.along) - (self._lead >= 0 and not self.locked)
+
+    @property
     def chained(self) -> bool:
         """See ``Interface``; True, since all rows depend on the contactor of the leading row."""
         return True
@@ -180,6 +185,25 @@ class Preloaded(Tie):
         more = -self.along[others, None, None] * by
         at = np.broadcast_to(of, (len(more), len(of)))
         return np.column_stack([nodes[others], at]), np.concatenate([vectors[others], more], axis=1)
+
+    def along_rows(self, gaps: Array) -> Array:
+        """Changes of the gaps of the rows in use, from those of all rows ``(m,)`` at a constant opening (collective)."""
+        if self.locked:
+            return gaps
+        own = gaps[self._lead] / self.along[self._lead] if self._lead >= 0 else None
+        opened = self.config.comm.bcast(own, root=self._root)
+        return np.asarray((gaps - opened * self.along)[np.arange(len(gaps)) != self._lead])
+
+    def back_to_rows(self, by_gaps: Array) -> Array:
+        """The transpose of ``along_rows``: derivatives by the gaps of all rows ``(m,)`` (collective)."""
+        if self.locked:
+            return by_gaps
+        found = np.zeros(len(self.along))
+        found[np.arange(len(found)) != self._lead] = by_gaps
+        opened = float(reduced(self.config.comm, float(found @ self.along)))
+        if self._lead >= 0:
+            found[self._lead] = -opened / self.along[self._lead]
+        return found
 
     def _bond(self, bond: Array) -> Array:
         """See ``Tie``; the leading row carries the rest of the given force (collective)."""

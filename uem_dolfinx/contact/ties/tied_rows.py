@@ -227,12 +227,11 @@ def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: boo
     assert isinstance(d.target, MeshTarget)
     s, own = at.segments, at.nodes
     e, q = at.facet, at.facet[s.pair]
-    tab, height = foot_below(d.target, at.y[s.pair], s.eta, np.einsum("qa,qag->qg", at.phi, at.x[q]))
-    k, (nc, nt) = len(e), (at.b.shape[1], tab.N.shape[1])
-    N = add_up(s.pair, products(s.weight[:, None] * at.b, tab.N), k).reshape(k, nc, nt)
+    tab, height, N, components = below(d, rows)
+    k, nc, nt = N.shape
     by_node, followed = np.zeros((len(own), nc, nc, g)), np.zeros((k, nc, nt, g))
     psi = np.zeros((len(s.pair), nc, g))
-    for c, duals in enumerate(_duals(d, rows, N)):
+    for c, duals in enumerate(components):
         by_node[..., c] = duals.C @ d.basis.T
         followed[..., c] = duals.A[e] @ N
         psi[..., c] = s.weight[:, None] * np.einsum("qib,qb->qi", duals.A[q], at.b)
@@ -253,6 +252,21 @@ def to_means(discretisation: Mortar, rows: WeightedRows, which: Bools, kept: boo
         d.elimination, has, scale, d.elimination.sides(own, by_node), area / scale, area[:, 0] / (rows.stretch * rows.sharing),
         terms, _standing(config, spacers), None, kept,
     )  # fmt: skip
+
+
+def below(d: Mortar, rows: WeightedRows) -> tuple[Tabulated, Array, Array, list[Duals]]:
+    """Closest points of the target at the points of segments of contact (collective).
+
+    Returns:
+        Shape functions there, heights ``(q,)``, integrals of the contactor's functions times them ``(k, nc, nt)``, and the dual
+        functions of each component.
+    """
+    at, s = rows.points, rows.points.segments
+    assert isinstance(d.target, MeshTarget)
+    tab, height = foot_below(d.target, at.y[s.pair], s.eta, np.einsum("qa,qag->qg", at.phi, at.x[at.facet[s.pair]]))
+    k, nc, nt = len(at.facet), at.b.shape[1], tab.N.shape[1]
+    N = add_up(s.pair, products(s.weight[:, None] * at.b, tab.N), k).reshape(k, nc, nt)
+    return tab, height, N, _duals(d, rows, N)
 
 
 def _duals(d: Mortar, rows: WeightedRows, N: Array) -> list[Duals]:
