@@ -124,6 +124,7 @@ class EnergyBook(Closing, given.Sealed):
         whole = [] if problem.impacts is None else problem.impacts.pairs
         #: Contacts whose forces act for whole implicit steps ``(n_contacts,)``.
         self._lasting = np.array([any(c.pair.whole is pair for pair in whole) for c in self._contacts], dtype=bool)
+        self._spreads = not self.dynamics.accelerated  # whether fluids spread at the start, in no time, before the next row
         # the work of the first step uses the initial load, too
         problem.set_load(self.dynamics.time)
         self._read_forces()
@@ -149,7 +150,7 @@ class EnergyBook(Closing, given.Sealed):
             known = problem.bodies.residual.array_r[:n] - self.dynamics.forces.x.array[:n]
         linear = 0.0 if problem.linear is None else problem.linear.forces(problem.linear.multipliers).ravel()
         leaking: list[Any] = [c.pair for c in self._contacts if c.leak is not None and c.on]
-        fluid = sum((pair.on_nodes().ravel() for pair in leaking), np.zeros(n))
+        self._fluid = fluid = sum((pair.on_nodes().ravel() for pair in leaking), np.zeros(n))
         held = ~problem.bodies.free[: problem.config.n_owned].ravel()
         reaction = (known[:n] - contact - linear - fluid) * held
         outer = reaction + fluid + self.dynamics.weight() + self._assembled(self._external)
@@ -196,9 +197,13 @@ class EnergyBook(Closing, given.Sealed):
             self._u, self._forces, self._resultants, self._time, self._driven, self._struck,
         )  # fmt: skip
         before, rate, steps = self._at_points, self._rate, self.problem.step_control.number - self._steps
+        fluid = self._fluid
         self._read_forces()
         # NumPy's sums do not depend on where arrays lie in memory, those of BLAS do
         works, impulse = 0.5 * ((forces + self._forces) * (self._u - u)).sum(axis=1), 0.5 * (resultants + self._resultants)
+        if self._spreads:
+            works[1] += 0.5 * ((self._fluid - fluid) * (self._u - u)).sum()
+            self._spreads = False
         if self._strikes:
             if steps == 1:
                 # the forces act between the mean velocities of two steps

@@ -31,7 +31,7 @@ from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.field_scales import Norm
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, reactions, refuse_idle, set_loads, taken_by, values_at
 from uem_dolfinx.solve.step_control import MENDABLE, StepControl
-from uem_dolfinx.solve.stepping import Progress, hold_others
+from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.united.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.united.system import BodySystem
 
@@ -221,8 +221,7 @@ class UnitedProblem(given.Sealed):
         self.system = method(self.bodies, self.interfaces, self.solver, **options)
         self.step_control = StepControl()  #: Length of time steps, with the history needed to control it.
         self.progress = Progress()  # in steps and in load
-        #: Displacement of the last converged state ``(n_local incl. ghosts,)``.
-        self.committed = np.array(u.x.array)
+        self.committed = np.array(u.x.array)  # displacement of the last converged state ``(n_local incl. ghosts,)``
         #: Motions of the rigid targets in that state; None for targets that had not moved, and for meshes.
         self.motions = self.rigid_motions()
         self.largest_forces: Norm = 0.0  #: Norm of the largest forces of all steps, as far as they exceed rounding.
@@ -275,6 +274,8 @@ class UnitedProblem(given.Sealed):
         Raises:
             InputError, InputTypeError, SpaceError: in statics, with an explicit scheme or while recording, or for other conditions.
         """
+        from uem_dolfinx.solve.united.starting import hold_others
+
         with agreed(self.comm):
             checks.check_hold(self)
             bcs = checks.check_conditions(self.config, bcs)

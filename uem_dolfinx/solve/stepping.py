@@ -265,30 +265,6 @@ def between_steps(
         (progress.interruption, progress.end), progress.inside = outer, False
 
 
-def hold_others(problem: Any, bcs: Sequence[Any]) -> None:
-    """Replace the Dirichlet conditions of a problem in time, checked, between two steps (collective).
-
-    The acceleration of what is released follows from the forces at this instant, as at the start.
-    """
-    from uem_dolfinx.contact.switched import hold
-
-    bodies, dynamics, config, held = problem.bodies, problem.dynamics, problem.config, problem.bodies.held
-    bodies.hold(bcs)
-    changed = held != bodies.held
-    if not reduced(problem.comm, bool(changed.any()), op=MPI.LOR):
-        return
-    free = bodies.free[: config.n_owned]
-    dynamics.hold(~free)
-    for pair in problem.interfaces:
-        hold(pair, free, config.of(changed).any(axis=1))
-    if problem.linear is not None:
-        problem.unite(problem.load, dynamics.time)
-        problem.system.take(problem.interfaces, problem.linear)
-    problem.set_load(dynamics.time, known=True)
-    dynamics.accelerated = False
-    (problem.impacts or problem.system).accelerate()
-
-
 @dataclass(frozen=True, repr=False)
 class LoadStep(ConvergedStep):
     """A converged load step.

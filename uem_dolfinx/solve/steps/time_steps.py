@@ -26,6 +26,7 @@ from uem_dolfinx.solve.stepping import TimeStep, begin_checkpoint, between_steps
 from uem_dolfinx.solve.steps.explicit_steps import explicit_steps
 from uem_dolfinx.solve.steps.load_steps import check_steps
 from uem_dolfinx.solve.united.newton import Iteration
+from uem_dolfinx.solve.united.starting import accelerate
 from uem_dolfinx.solve.united.system import CLOSED
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ def _time_steps(
     control.begin(dt)
     problem.set_load(dynamics.time)
     first = not dynamics.accelerated
-    (problem.impacts or problem.system).accelerate()
+    accelerate(problem)
     if first and problem.history is not None:
         problem.history.note_start()
     before, rounding = touching(problem), _rounding(dynamics, dt, end)

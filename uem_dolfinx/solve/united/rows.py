@@ -41,9 +41,10 @@ class OverConstraints:
     Args:
         pairs: of all contacts; ``mutual`` of their settings is set if surfaces are contactor and target of each other.
         linear: equations of users, or None.
+        held: whether conditions hold contactors that the pairs do not know of.
     """
 
-    def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None):
+    def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None, held: bool = False):
         self._unknowns = config.unknowns
         self._last: Restriction | None = None  # the restriction made last
         # joined contacts are compared one by one
@@ -83,7 +84,7 @@ class OverConstraints:
             pair.discretisation.traits.chained or (pair.tie is not None and pair.tie.chained) for pair in whole
         )
         #: whether equations can conflict even if they do not follow each other in a ring.
-        self.contestable = self.shared or any(pair.discretisation.setting.prescribed for pair in whole)
+        self.contestable = held or self.shared or any(pair.discretisation.setting.prescribed for pair in whole)
         if any(_united_fields(pair) for pair in pairs):
             # rows contain temperatures of both sides, which may be prescribed
             self.stacked = self.contestable = True
