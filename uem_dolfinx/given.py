@@ -6,9 +6,12 @@ Every message contains the name of the argument, its value, the expected values 
 from __future__ import annotations
 
 import inspect
+import pickle
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache, wraps
 from pathlib import Path
@@ -243,7 +246,41 @@ def alike(comm: MPI.Comm, where: str, **values: Any) -> None:
                 )
 
 
-class Sealed:
+class Copied:
+    """A public object that copies and pickles as Python does, or names itself where what it belongs to does not."""
+
+    def __copy__(self) -> Any:
+        """Another object with the same attributes."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        """An object with copies of all attributes; InputTypeError if there are none."""
+        memo[id(self)] = other = object.__new__(type(self))
+        with self._of_its_own("copied"):
+            other.__dict__.update(deepcopy(self.__dict__, memo))
+        return other
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """For ``pickle``; InputTypeError if it cannot keep all attributes."""
+        with self._of_its_own("pickled"):
+            pickle.dumps(self.__dict__, protocol)
+        return object.__new__, (type(self),), self.__dict__
+
+    @contextmanager
+    def _of_its_own(self, done: str) -> Iterator[None]:
+        """Context in which errors of Python about attributes become one about this object."""
+        try:
+            yield
+        except (TypeError, AttributeError, RecursionError, pickle.PicklingError) as error:
+            raise InputTypeError(
+                f"{described(self)} cannot be {done}, since a mesh, a file or a function of the script belongs to it: expected an object "
+                f"of numbers; make another {type(self).__name__}, or keep a problem by uem.write_checkpoint(path, problem.state())"
+            ) from error
+
+
+class Sealed(Copied):
     """A public object that, once made, refuses to set unknown attributes, and arguments that no longer have an effect.
 
     Attributes:

@@ -23,6 +23,10 @@ def cylinder(cell="quadrilateral", degree=1, n=(4, 2)):
     return Revolved(rectangle((0, 0), (R, H), n, cell), cell=cell, degree=degree)
 
 
+def plane_form(u):
+    return uem.LinearElastic(1.0, 0.3, kind="plane_strain").residual(u, ufl.TestFunction(u.function_space)) * ufl.dx
+
+
 class TestRefused:
     def test_nodes_beyond_the_axis(self):
         s = scene(COMM, "triangle", [box("triangle", (-0.1, 0), (1, 1), (2, 2))])
@@ -32,6 +36,14 @@ class TestRefused:
         s = scene(COMM, "tetrahedron", [box("tetrahedron", (0, 0, 0), (1, 1, 1), (1, 1, 1))])
         refused(uem.MeshError, ["dimension 3", "plane"], lambda: uem.axisymmetric(s.mesh))
         refused(uem.InputTypeError, ["mesh", "read_gmsh"], lambda: uem.axisymmetric("mesh.msh"))
+
+    def test_meshes_that_are_in_use(self):
+        """A mass or a problem of a plane mesh would stay plane; declared twice is declared."""
+        for use in (lambda u: uem.lumped_mass(u.function_space, 1.0), lambda u: uem.UnitedProblem(plane_form(u), u)):
+            s = scene(COMM, "triangle", [box("triangle", (0, 0), (1, 1), (2, 2))])
+            use(fem.Function(compat.function_space(s.mesh, 1, (2,))))
+            refused(uem.MeshError, ["plane mass or problem", "right after"], lambda s=s: uem.axisymmetric(s.mesh))
+        assert uem.axisymmetric(mesh := cylinder().mesh) is mesh
 
     def test_rounding_is_no_node_beyond_the_axis(self):
         b = rectangle((0, 0), (1, 1), (2, 2))

@@ -5,7 +5,9 @@ The test to read first is ``test_misspelt``.
 
 from __future__ import annotations
 
+import copy
 import inspect
+import pickle
 
 from mpi4py import MPI
 
@@ -75,6 +77,25 @@ def test_late(folder):
         before = one.__dict__.get(what)
         refused(uem.InputError, ("make a new", what), lambda one=one, what=what, value=value: setattr(one, what, value))
         assert one.__dict__.get(what) is before, (name, what)
+
+
+def test_copies(folder):
+    """What has numbers alone is copied and pickled; what a mesh or a file belongs to names itself, and says what to do."""
+    b, objects = blocks(COMM, "triangle"), made(folder)
+    objects |= {"mass": uem.lumped_mass(b.V, 1.0), "tag": b.high, "soft": uem.NeoHooke(fem.Constant(b.scene.mesh, 1.0), 0.3)}
+    for name in ("point", "spring", "equation", "general", "elastic", "slide"):
+        for other in (copy.deepcopy(objects[name]), pickle.loads(pickle.dumps(objects[name])), copy.copy(objects[name])):
+            assert type(other) is type(objects[name]) and repr(other) == repr(objects.get(name))
+        objects.pop(name)
+    moved = copy.deepcopy(plane := objects["plane"])
+    moved.move((0.0, 0.1))
+    assert moved.motion is not None and plane.motion is None
+    for name in ("heat", "step", "checkpoint", "plane", "sphere", "warm"):
+        objects.pop(name)
+    for one in objects.values():
+        for how in (copy.deepcopy, pickle.dumps):
+            refused(uem.InputTypeError, (type(one).__name__, "cannot be", "make another"), lambda one=one, how=how: how(one))
+    refused(uem.InputTypeError, "a RigidPlane cannot be pickled", lambda: pickle.dumps(plane))
 
 
 def test_a_word_that_is_near():

@@ -82,7 +82,7 @@ MOST_HALVINGS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Mass:
+class Mass(given.Copied):
     """Mass matrix of a displacement; its components are not coupled.
 
     Attributes:

@@ -24,6 +24,8 @@ from uem_dolfinx.parallel import agree, reduced
 
 #: UFL domains of the meshes that have been declared, by their numbers: their hashes may change.
 _DECLARED: WeakValueDictionary[int, Any] = WeakValueDictionary()
+#: Those of plane meshes that masses or problems have been made of.
+_PLANE: WeakValueDictionary[int, Any] = WeakValueDictionary()
 
 
 def axisymmetric(mesh: Any) -> Any:
@@ -40,10 +42,15 @@ def axisymmetric(mesh: Any) -> Any:
 
     Raises:
         InputTypeError: for other objects.
-        MeshError: if the mesh is not plane, or has nodes beyond the axis.
+        MeshError: if the mesh is not plane, has nodes beyond the axis, or has a mass or a problem already.
     """
     given.kind("mesh", mesh, _is_mesh(mesh), "a mesh, as read_gmsh returns it")
     gdim, tdim = mesh.geometry.dim, mesh.topology.dim
+    if mesh.ufl_domain().ufl_id() in _PLANE:
+        raise MeshError(
+            "a mesh of which a plane mass or problem has been made is to be axisymmetric: expected uem.axisymmetric(mesh) before; call it "
+            "right after the mesh is made, or make another mesh"
+        )
     if (gdim, tdim) != (2, 2):
         raise MeshError(f"an axisymmetric mesh of dimension {tdim} in {gdim}D: expected a plane one, whose x is the radius")
     x = mesh.geometry.x[:, :2]
@@ -66,6 +73,14 @@ def is_axisymmetric(part: Any) -> bool:
         return False
     domains = [part.ufl_domain()] if _is_mesh(part) else ufl.domain.extract_domains(part)
     return any(domain.ufl_id() in _DECLARED for domain in domains)
+
+
+def taken_as_axisymmetric(mesh: Any) -> bool:
+    """As ``is_axisymmetric``, for a mass or a problem: a mesh that is plane then stays so."""
+    found, domain = is_axisymmetric(mesh), mesh.ufl_domain()
+    if not found:
+        _PLANE[domain.ufl_id()] = domain
+    return found
 
 
 def revolved(form: ufl.Form) -> ufl.Form:

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import AnyArray, Array, Indices
 from uem_dolfinx.errors import SpaceError
-from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
+from uem_dolfinx.geometry.axisymmetry import taken_as_axisymmetric
 from uem_dolfinx.geometry.bodies import rigid_velocities
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import reduced
@@ -56,7 +56,7 @@ class Configuration(Nodes):
         #: Shared facets of surfaces while they are in use, by ``id`` of their tags; see ``facets.facets_of``.
         self.surfaces: WeakValueDictionary[int, Any] = WeakValueDictionary()
         #: Whether the coordinates are radius and height, and nodes represent circles.
-        self.axisymmetric: bool = is_axisymmetric(V.mesh)
+        self.axisymmetric: bool = taken_as_axisymmetric(V.mesh)
 
     @property
     def unknowns(self) -> Any:

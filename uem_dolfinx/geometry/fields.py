@@ -21,7 +21,7 @@ from petsc4py import PETSc
 from uem_dolfinx import compat, forms, given
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, is_whole
 from uem_dolfinx.errors import InputError, SpaceError
-from uem_dolfinx.geometry.axisymmetry import is_axisymmetric
+from uem_dolfinx.geometry.axisymmetry import taken_as_axisymmetric
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.parallel import Exchange, agreed, gathered, reduced
@@ -321,7 +321,7 @@ class ScalarConfiguration(Configuration):
             )
         self.degree: int = degree
         Nodes.__init__(self, V)
-        self.axisymmetric = is_axisymmetric(V.mesh)
+        self.axisymmetric = taken_as_axisymmetric(V.mesh)
 
     def place_of(self, unknown: int) -> str:
         """Position of the node of a local unknown, for error messages."""

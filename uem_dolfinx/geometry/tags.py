@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
-from uem_dolfinx import compat
+from uem_dolfinx import compat, given
 from uem_dolfinx.arrays import Indices
 from uem_dolfinx.errors import SpaceError, TagError
 from uem_dolfinx.given import did_you_mean, shown
@@ -26,7 +26,7 @@ are asked for), which each rank may give for what it owns, or also for ghosts; o
 
 
 @dataclass(frozen=True)
-class Tag:
+class Tag(given.Copied):
     """A physical group of a mesh.
 
     Attributes:

@@ -28,7 +28,7 @@ POISSON = given.between(-1.0, 0.5, "a body that hardly changes its volume has 0.
 
 
 @dataclass(frozen=True)
-class Elastic(ABC):
+class Elastic(given.Copied, ABC):
     """Base of the elastic laws.
 
     Attributes:
