@@ -68,7 +68,7 @@ def test_energy_given(caplog):
 
     def refuse(energy, length):
         force = np.tile([0.0, 2 * energy / total], n)
-        _refuse_given_energy(problem, problem.dynamics, length, [force])
+        _refuse_given_energy(problem, problem.dynamics, length, [force], [])
 
     refuse(0.3, 0.01)
     with caplog.at_level(logging.WARNING, logger="uem_dolfinx"):

@@ -46,7 +46,8 @@ def led(make, failing, way=WAY, made=()):
         if failing:
             lead(FAR)
             problem.max_iterations = 2
-            with suppress(uem.ConvergenceError):
+            # so far off the bodies' tangent may be indefinite, of which multigrid makes no preconditioner
+            with suppress(uem.ConvergenceError, uem.LinearSolveError):
                 problem.attempt()
                 problem.restore()
             problem.max_iterations = most

@@ -1,5 +1,7 @@
 """Contact by elimination: when gaps count as closed, and what a solve predicts."""
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -91,7 +93,7 @@ def test_what_a_solve_predicts(length):
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_the_united_matrix_follows_q(coupling):
-    """Where limits of friction are held Q is P, which is what it was with rotated rows: the matrix is made anew, and back again."""
+    """Where all contactors stick Q is P, and has rotated rows where they slip: the matrix is made anew, and back again."""
     d = driven(mu=0.3, how={"coupling": coupling, "sliding": "small"}, options={"consistent_tangent": False})
     for place in ((0.0, -0.01), (0.1, -0.01)):
         d.to(*place)
@@ -101,10 +103,12 @@ def test_the_united_matrix_follows_q(coupling):
     d.problem.bodies.assemble()
     before = system.assemble_constraints(lambda *norms: False)
     system.linearise(before, 0)
-    for lam in (None, pair.trial.lam, None):
-        pair.friction.hold_limits(lam)
+    slips = pair.trial
+    sticks = replace(slips, friction=replace(slips.friction, stick=slips.active))
+    for trial in (slips, sticks, slips):
+        pair.take(trial)
         state = system._with_rows(before)
-        assert (state.test is state.trial) == (lam is not None)
+        assert (state.test is state.trial) == (trial is sticks)
         linearised = system.linearise(state, None)
         loads = d.problem.bodies.residual.duplicate()
         loads.set(1.0)

@@ -245,8 +245,7 @@ class Contact(WatchedContact, given.Sealed):
         if isinstance(self._offset, fem.Function) and self._offsets_of_pair().read_again(self._offset):
             self._set_offset()
             self.pair.project()
-        law = as_law(self._friction)
-        if not is_read_again(law):
+        if isinstance(self._friction, float) or not is_read_again(law := as_law(self._friction)):
             return
         value, friction = self._friction_at(law, self.pair.nodes, at), self.pair.friction
         assert value is not None and friction is not None
@@ -276,8 +275,9 @@ class Contact(WatchedContact, given.Sealed):
 
     def _friction_now(self, kinematics: Kinematics) -> Array | None:
         """Values at contactors after a placement ``(n,)``; None if they do not depend on it (collective)."""
-        law = as_law(self._friction)
-        return self._friction_at(law, self.pair.nodes, self._at) if isinstance(law.field, OfTemperature) else None
+        if isinstance(self._friction, float) or not isinstance((law := as_law(self._friction)).field, OfTemperature):
+            return None
+        return self._friction_at(law, self.pair.nodes, self._at)
 
     @property
     def offset(self) -> Field:

@@ -36,7 +36,6 @@ class Limits:
     def __init__(self, areas: Callable[[Array | None], Array], duration: Callable[[], float] | None):
         self.areas_of, self.duration = areas, duration
         self.whole = False  # whether friction acts for whole steps with its force at the end
-        self._held: Array | None = None  # normal forces at which limits are fixed ``(n,)``, or None
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set a law and the values of its parameter ``(n,)`` (collective)."""
@@ -60,7 +59,7 @@ class Limits:
     @property
     def given(self) -> tuple[Any, ...]:
         """What ``cone`` depends on in addition to its arguments; arrays are replaced, never changed."""
-        return self.law, self.value, self.area, self.speed, self._held
+        return self.law, self.value, self.area, self.speed
 
     def grow(self, kinematics: Kinematics) -> None:
         """Update the areas to the current placement (collective)."""
@@ -73,18 +72,9 @@ class Limits:
         if of_rate(self.law) and dt > 0.0:
             self.speed = way / dt
 
-    def hold(self, lam: Array | None) -> Array:
-        """Fix the limits at normal forces ``lam (n,)``, or not, for None: this rank's largest change, and the largest limit ``(2,)``."""
-        before, self._held = self._held, None if lam is None else np.maximum(lam, 0.0)
-        if self._held is None:
-            return np.zeros(2)
-        now = self._stuck(self._held)[0]
-        change = now if before is None else np.abs(now - self._stuck(before)[0])
-        return np.array([change.max(initial=0.0), now.max(initial=0.0)])
-
     def of(self, lam: Array, slips: Bools) -> tuple[Array, Array, Array]:
         """Limits at normal forces ``lam (n,)``, of which some contactors slip, and derivatives by ``lam`` and the slip."""
-        lam = np.maximum(lam, 0.0) if self._held is None else self._held
+        lam = np.maximum(lam, 0.0)
         limit, slope = self._stuck(lam)
         rate = none = np.zeros(len(limit))
         if slides_otherwise(self.law):
@@ -92,7 +82,7 @@ class Limits:
             limit, slope, rate = (np.where(slips, new, old) for new, old in zip(sliding, (limit, slope, rate)))
             dt = 0.0 if self.duration is None else self.duration()
             rate = rate / dt if dt > 0.0 else none
-        return limit, slope if self._held is None else none, rate
+        return limit, slope, rate
 
     def cone(self, lam: Array, slips: Bools) -> tuple[Array, Array]:
         """Limits as linear functions of the normal force, about ``lam (n,)``: values at 0 and slopes ``(n,)``."""

@@ -75,7 +75,7 @@ class Sliding:
         self.last: LastStep | None = None
         self.pivot = Pivot.begin(np.zeros(n), *np.zeros((2, n, g)))
         #: The last state and what its limits depend on, and these limits.
-        self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 6, (np.zeros(n), np.zeros(n))
+        self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 5, (np.zeros(n), np.zeros(n))
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set the law and the values of its parameter ``(n,)``."""
@@ -160,10 +160,6 @@ class Sliding:
         """Limit of the tangential force in a state, or with other normal forces ``lam (n,)``: ``(n,)``."""
         return self.limits.of(state.lam if lam is None else lam, self.slipping(state))[0]
 
-    def hold_limits(self, lam: Array | None) -> Array:
-        """Fix the limits at normal forces ``lam (n,)``; see ``Limits.hold``."""
-        return self.limits.hold(lam)
-
     def _cone(self, state: PairState) -> tuple[Array, Array]:
         if any(map(is_not, of := (state, *self.limits.given), self._cones[0])):
             self._cones = of, self.limits.cone(state.lam, self.slipping(state))
@@ -207,10 +203,12 @@ class Sliding:
         (forces, lengths), active = rounding, self.active(state)
         return stick_slip.find_violations(violated, turned, active, by, force_rounding=forces, gap_rounding=lengths)
 
-    @property
-    def forced(self) -> Bools:
-        """Contactors that have slipped along prescribed components in this step ``(n,)``."""
-        return np.asarray(self.frame.forced(self.frame.away, self._lost) > GAP_ROUNDING * self.config.size)
+    def forced(self, du: Array | None = None) -> Bools:
+        """Contactors that slip along prescribed components in this step, with an increment ``du (n_owned, gdim)`` or None (collective)."""
+        away = self.frame.away
+        if du is not None and (self.frame.prescribed or self.frame.other_normals.shape[1]):
+            away = away + self.frame.way.relative(du)
+        return np.asarray(self.frame.forced(away, self._lost) > GAP_ROUNDING * self.config.size)
 
     @property
     def _lost(self) -> Bools:
@@ -262,7 +260,7 @@ class Sliding:
         T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.ties.share[:, None]
         # prescribed components at rest carry no friction; if all are prescribed, only the moving ones do
         told = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
-        goes = self.forced | stick_slip.continues(_of(state).direction, T, frame.away, GAP_ROUNDING * self.config.size)
+        goes = self.forced() | stick_slip.continues(_of(state).direction, T, frame.away, GAP_ROUNDING * self.config.size)
         tau = np.where((told & (goes == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
         q = c[:, None] * frame.slip - tau
         self.pivot = Pivot.begin(c, q, tau)

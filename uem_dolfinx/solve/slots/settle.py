@@ -73,13 +73,12 @@ class _Slots:
         every = np.append(self.normal, self.tangents)
         return every[every >= 0]
 
-    @property
-    def describable(self) -> bool:
-        """Whether two laws, of a gap and of a slip, describe all contactors of this rank."""
+    def describable(self, du: Array) -> bool:
+        """Whether two laws, of a gap and of a slip, describe all contactors of this rank, which increments ``du`` lead (collective)."""
         friction, cornered = self.pair.friction, bool(self.pair.trial.in_corner.any())
         of_speed = friction is not None and slides_otherwise(friction.limits.law)
         # slip along prescribed components takes part of the friction that slots count as their own
-        led = friction is not None and bool((friction.forced[self.contactor] & (self.tangents >= 0).any(axis=1)).any())
+        led = friction is not None and bool((friction.forced(du)[self.contactor] & (self.tangents >= 0).any(axis=1)).any())
         return not (cornered or self.pair.trial.has_law or self.pair.tie or self.pair.heats or of_speed or led)
 
     def limits(self) -> tuple[Array, Array]:
@@ -150,7 +149,8 @@ def settle(
     for pair, own in equations.items():
         slots.append(_Slots.of(pair, own, first, near[first : first + len(own)]))
         first += len(own)
-    described = test.rings is None and first == len(whole) and all(one.describable for one in slots)
+    led = np.where(bodies.free[: len(du)], du, bodies.prescribed[: len(du)])
+    described = all([one.describable(led) for one in slots]) and test.rings is None and first == len(whole)
     number, refused = reduced(comm, np.array([sum(len(one.rows) for one in slots), not described], dtype=np.int64))
     if refused or not 0 < number <= MOST_SLOTS:
         return None

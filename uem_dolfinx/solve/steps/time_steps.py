@@ -145,9 +145,10 @@ def _time_steps(
         parts = np.round(rest / shortest)
         length = min(control.longest, float(parts * shortest) if abs(rest - parts * shortest) <= rounding else rest)
         try:
-            forces = _contact_forces(problem)
+            forces = _contact_forces(problem, before)
             length, iterations = _step(problem, length, before, tolerance)
-            _refuse_given_energy(problem, dynamics, length, forces)
+            after = touching(problem)
+            _refuse_given_energy(problem, dynamics, length, forces, after)
             longer = 2.0 if accuracy is None or _accurate(problem, dynamics, length, accuracy) else 1.0
         except UEMError as error:
             dynamics.restore()
@@ -161,7 +162,6 @@ def _time_steps(
         if abs(dynamics.time - nearest) <= rounding:
             dynamics.time = float(nearest)
         number, cuts = control.done(iterations, longer)
-        after = touching(problem)
         yield TimeStep(number, dynamics.time, length, iterations, cuts, *events(problem, before, after))
         # the caller may have repeated the step
         before = touching(problem)
@@ -218,9 +218,9 @@ def _accurate(problem: UnitedProblem, dynamics: Dynamics, length: float, accurac
     return 2.0 * length <= control.accurate
 
 
-def _contact_forces(problem: UnitedProblem) -> list[Array]:
-    """Contact forces on both bodies, at this rank's nodes, of each contact that should do no work (collective)."""
-    closed = compress(problem.contacts, touching(problem))
+def _contact_forces(problem: UnitedProblem, touches: list[bool]) -> list[Array]:
+    """Contact forces on both bodies, at this rank's nodes, of each contact that ``touches`` and should do no work (collective)."""
+    closed = compress(problem.contacts, touches)
     own = slice(problem.config.gdim * problem.config.n_owned)
     idle = [
         c for c in closed if not (c.pair.trial.has_law or c.pair.target.motion or (c.pair.tie is not None and c.pair.tie.works))
@@ -228,7 +228,9 @@ def _contact_forces(problem: UnitedProblem) -> list[Array]:
     return [np.array(c.force.x.array[own]) for c in idle]
 
 
-def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array]) -> None:
+def _refuse_given_energy(
+    problem: UnitedProblem, dynamics: Dynamics, length: float, before: list[Array], touches: list[bool]
+) -> None:
     """EnergyGivenError for a step in which contacts have added energy beyond the limit (collective).
 
     In the trapezoidal rule, contactors that are released or slide round a bend do work with half of their initial force; it decreases
@@ -241,7 +243,7 @@ def _refuse_given_energy(problem: UnitedProblem, dynamics: Dynamics, length: flo
         before = []
     elif dynamics.contactors == "massy":
         return
-    if not (forces := before + _contact_forces(problem)):
+    if not (forces := before + _contact_forces(problem, touches)):
         return
     config = problem.config
     way = config.of(problem.u.x.array - problem.committed)[: config.n_owned].ravel()

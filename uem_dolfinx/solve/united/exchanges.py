@@ -1,12 +1,6 @@
 """Choice of the contactors that violate their conditions and change state, in each active-set change and each iteration.
 
 A repeated state is detected, and another rule is then used. If no rule is left, an error names the contactors that cycle.
-
-If all contactors of a body held only by friction slip, the Coulomb forces of one contact may balance those of another at any magnitude:
-the constrained matrix is singular, and predicted motions are huge. Then, from the previous state, the friction limits are fixed at the
-values given by the normal forces, as in Tresca's law. The matrix is then symmetric, and without the curvature of contact the problem is
-convex. Its normal forces give new limits, until these have converged; then Coulomb's law is used again. Limits are also fixed once in
-every linearised problem in which contactors would otherwise change one by one.
 """
 
 from __future__ import annotations
@@ -30,11 +24,9 @@ from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import ConvergenceError, FrictionError
 from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.rigid.first_touch import deepest_of
-from uem_dolfinx.solve.rigid.floating import FAR
 
 if TYPE_CHECKING:
     from uem_dolfinx.algebra.linear_solver import UnitedSolver
-    from uem_dolfinx.contact.friction.stick_slip import Pivot
     from uem_dolfinx.solve.united.newton import Increment
 
 #: The order of contactors that are exchanged one by one is that of their places in the drawing along this direction.
@@ -61,9 +53,6 @@ MOST_ROUNDS = 6
 #: A state that has come again so often although no contactor changes gets a convex tangent the next time.
 #: [convention; iterations; test_exchanges.py::test_convex_until_it_gets_better]
 OFTEN = 3
-#: Limits of friction that change by less than this part of the largest are near enough to begin with Coulomb's law.
-#: [convention; the largest limit; test_exchanges.py::test_limits_are_held_until_they_settle]
-LIMITS_NEAR = 0.1
 #: So many of the contactors that change sides for ever are named.
 #: [convention; contactors; test_exchanges.py::test_who_goes_in_a_circle_is_named]
 NAMED = 3
@@ -89,8 +78,6 @@ class Exchanges:
         convex: whether terms of the curvature that could make the tangent indefinite are neglected. Beyond a limit point, Newton's
             method does not leave the path by itself; with a convex tangent the bodies reach another equilibrium of lower energy.
         frozen: whether stick and slip states are fixed until the bodies have moved.
-        held: whether limits of friction are fixed; see test_friction_moving_targets.py::test_a_slender_block_on_a_turntable.
-        again: whether the linearised problem must be solved again with other limits of friction, even without changes of state.
     """
 
     def __init__(self, pairs: Sequence[Interface]):
@@ -134,17 +121,11 @@ class Exchanges:
 
     def begin(self) -> None:
         """Begin another linearised problem."""
-        self._pivoting, self.straight, self.frozen, self.again = Pivoting(), False, False, False
+        self._pivoting, self.straight, self.frozen = Pivoting(), False, False
         self._number, self._alone, self._rule, self._on_arrays = 0, 0, Rule.ALL, False
         #: States before contactors were released, and whether they are kept although these violate their conditions.
         self._before: list[PairState] | None = None
         self._stays = False
-        #: Whether limits are and have been fixed, and the last states without a mechanism.
-        self.held = self._were_held = False
-        self._known: list[tuple[PairState, Pivot] | None] | None = None
-        for pair in self._pairs:
-            if pair.friction is not None:
-                pair.friction.hold_limits(None)
         #: Contactors that have changed state in this problem, and by the present rule.
         self._changed, self._lately = self._none(), self._none()
 
@@ -159,8 +140,7 @@ class Exchanges:
             gives_way: whether it needs one with friction that serves for all problems.
         """
         cheap = cheap and not (gives_way and self.frictional)
-        made = self._number >= (AS_LONG_IF_CHEAP if cheap else 0) and not (self.held or self._were_held or self.frozen)
-        if self._on_arrays or not made or not self._pairs:
+        if self._on_arrays or self.frozen or self._number < (AS_LONG_IF_CHEAP if cheap else 0) or not self._pairs:
             return False
         new = sum(int((w.enter & ~pair.trial.reserved).sum()) for w, pair in zip(violated, self._pairs))
         number, new = reduced(self._pairs[0].config.comm, np.array([sum(w.count for w in violated), new]))
@@ -170,7 +150,7 @@ class Exchanges:
         return True
 
     def choose(
-        self, violated: list[Violations], gaps: Sequence[Array], curved: bool, way: float = 0.0, climbs: bool = False
+        self, violated: list[Violations], gaps: Sequence[Array], curved: bool, climbs: bool = False
     ) -> list[Violations] | None:
         """Contactors that change state now; None if the linearised problem is solved.
 
@@ -178,7 +158,6 @@ class Exchanges:
             violated: violations of every pair.
             gaps: that decide on contact, of every pair ``(n,)``.
             curved: whether the linearised problem includes the curvature of contact.
-            way: largest displacement of a node, a length.
             climbs: whether softening makes the linearised problem indefinite: it is left out, which bounds the energy from above.
 
         Raises:
@@ -202,23 +181,10 @@ class Exchanges:
         own = np.sum([(w.count, w.enter.sum(), pair.trial.active.sum(), len(pair.nodes)) for w, pair in both], axis=0)
         told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
         (number, entering, active, every), state = told[:, :4].sum(axis=0), tuple(told[:, 4])
-        self.again, self._before = False, None if entering else [pair.trial for pair in self._pairs]
+        self._before = None if entering else [pair.trial for pair in self._pairs]
         if not number:
-            if not self.held:
-                return None
-            self._let_limits_follow(violated)
-            return violated
-        free = self.frictional and not self.held
-        far = free and way > FAR * self._pairs[0].config.size and self._known is not None
-        if free and not far:
-            self._known = self._here(violated)
-        chosen, rule = violated, self._rule if far else self._pivoting.choose(int(number), state)
-        if far or (free and rule >= Rule.FIRST and not (self._were_held or self.frozen)):
-            if curved:
-                # without curvature the problem with fixed limits is convex
-                self.straight = self.convex = True
-            self._hold_limits()
-            return [w.among(np.zeros_like(w.enter)) for w in violated]
+            return None
+        chosen, rule = violated, self._pivoting.choose(int(number), state)
         if rule >= Rule.FIRST and (curved or self.softens) and not self.straight:
             # with curvature or softening the problem may have no solution or several; without it has exactly one
             self._pivoting, self.straight, self.convex = Pivoting(), True, True
@@ -239,51 +205,10 @@ class Exchanges:
             if self._alone > MOST_OF_EACH * every:
                 raise self._circle(self._lately)
             return chosen
-        self._solve_again()
-        return chosen
-
-    def _solve_again(self) -> None:
         self._number += 1
         if self._number > MOST_EXCHANGES:
             raise self._circle(self._lately)
-
-    def _here(self, violated: Sequence[Violations]) -> list[tuple[PairState, Pivot] | None]:
-        """States of the pairs with friction, with the predicted normal forces."""
-        from uem_dolfinx.contact.friction.stick_slip import FrictionViolations
-
-        here: list[tuple[PairState, Pivot] | None] = []
-        for pair, w in zip(self._pairs, violated):
-            if pair.friction is None or not isinstance(w, FrictionViolations):
-                here.append(None)
-            else:
-                here.append((replace(pair.trial, lam=w.seen.lam), pair.friction.pivot))
-        return here
-
-    def _hold_limits(self) -> None:
-        """Return to the last state without a mechanism, and fix the limits given by its forces (collective)."""
-        for pair, known in zip(self._pairs, self._known or ()):
-            if pair.friction is not None and known is not None:
-                state, pivot = known
-                pair.take(replace(state, reserved=pair.trial.reserved), pivot)
-                pair.friction.hold_limits(state.lam)
-        self._pivoting, self.held, self._were_held, self.again = Pivoting(), True, True, True
-        self._solve_again()
-
-    def _let_limits_follow(self, violated: Sequence[Violations]) -> None:
-        """Update the fixed limits from the present forces, or return to Coulomb's law if they have converged (collective)."""
-        self._known, each = self._here(violated), np.zeros(2)
-        for pair, known in zip(self._pairs, self._known):
-            if pair.friction is not None and known is not None:
-                pair.take(replace(known[0], reserved=pair.trial.reserved))
-                each = np.maximum(each, pair.friction.hold_limits(pair.trial.lam))
-        self._pairs[0].config.comm.Allreduce(MPI.IN_PLACE, each, op=MPI.MAX)
-        if each[0] <= LIMITS_NEAR * each[1]:
-            for pair in self._pairs:
-                if pair.friction is not None:
-                    pair.friction.hold_limits(None)
-            self.held = False
-        self._pivoting, self.again = Pivoting(), True
-        self._solve_again()
+        return chosen
 
     def _none(self) -> list[Bools]:
         return [np.zeros(len(pair.nodes), dtype=bool) for pair in self._pairs]
@@ -339,11 +264,10 @@ class Exchanges:
         calm = reduced(comm, np.array([_calm(pair, c) for pair, c in zip(self._pairs, changed)]), op=MPI.LOR)
         for pair in (pair for pair, some in zip(self._pairs, calm) if some):
             pair.project()
-        calmed = bool(calm.any())
         # no rule has found the active set of the last linearised problem, and the same state was reached again
-        if self._rounds == MOST_ROUNDS or (self.frozen and not calmed):
+        if self._rounds == MOST_ROUNDS or (self.frozen and not calm.any()):
             raise self._circle(changed)
-        return calmed
+        return bool(calm.any())
 
     def _state(self) -> tuple[int, ...]:
         """Fingerprint of the present states of all contactors."""

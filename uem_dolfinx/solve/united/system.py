@@ -299,7 +299,7 @@ class BodySystem:
                 return self._with_rows(state, solved)
             climbs = self.exchanges.softens and self.exchanges.climbs(self.solver, step)
             any_left = violated if self._adrift and count(self.pairs, violated) else None
-            chosen = any_left if self._adrift else self.exchanges.choose(violated, gaps, self.curvature is not None, way, climbs)
+            chosen = any_left if self._adrift else self.exchanges.choose(violated, gaps, self.curvature is not None, climbs)
             if chosen is None and sliding is not None and not self.exchanges.frozen:
                 raise united_rows.not_held()
             if chosen is None or self._adrift:
@@ -424,8 +424,6 @@ class BodySystem:
 
     def solve(self, problem: LinearisedProblem, accuracy: float, near: PETSc.Vec | None) -> Increment:
         """Unknowns dq, and ``du = P dq + c``, in all nodes if open motions or separated contacts need them (collective)."""
-        # friction limits follow predicted forces, which must then be as accurate as with a direct solver
-        accuracy = min(accuracy, PREDICTED) if self.exchanges.held else accuracy
         self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
         if near is None:
