@@ -80,6 +80,25 @@ def test_gmres_gives_way(comm, scale, gives_way, monkeypatch):
         assert (K * dq - rhs).norm() <= 1e-9 * rhs.norm()
 
 
+def test_gmres_in_place_of_cg_remembers(comm):
+    """In place of CG that a user has chosen, too: one cycle solves what takes a third more iterations in cycles of 30."""
+    config = Configuration(blocks(comm, "triangle", 16, 16, gap=0.5).u)
+    taken = []
+    for more in ({}, {"ksp_gmres_restart": 30}):
+        solver = UnitedSolver(config, "gmres_remembers_", {"ksp_type": "cg", "pc_type": "none", "ksp_max_it": 5000} | more)
+        K, P = mass(config), united(config, [])
+        rows = K.createVecLeft()
+        rows.array[:] = 5.0 ** (np.arange(*rows.owner_range) / rows.size) * (1.0 + np.arange(rows.local_size) % 3)
+        K.diagonalScale(rows, None)
+        rhs = K.createVecLeft()
+        rhs.array[:] = np.cos(np.arange(rhs.local_size))
+        solver.set_operator(P, K, None)
+        dq, iterations = solver.solve(rhs)
+        assert solver.ksp.getType() == "gmres" and (K * dq - rhs).norm() <= 1e-9 * rhs.norm()
+        taken.append(iterations)
+    assert taken[0] <= options.GMRES_RESTART < taken[1]
+
+
 @pytest.mark.parametrize("part, symmetric", [(0.0, True), (3e-12, True), (3e-11, False)])
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e12])
 def test_what_counts_as_symmetric(comm, part, symmetric, scale):

@@ -134,6 +134,8 @@ class KspOfOptions(Returning):
         if ksp_type != self._types[0] or symmetric:
             # GMRES measures true residuals, without preconditioner: P'KP is nearly singular if all contactors slip
             self.ksp.setPCSide(PETSc.PC.Side.LEFT if symmetric else PETSc.PC.Side.RIGHT)
+        if ksp_type != self._types[0]:
+            self.ksp.setGMRESRestart(GMRES_RESTART)
         pc.setType(pc_type)
         # a new PC reads its own options; an unchanged PC must not read them again, because hypre would lose its set-up
         reader = pc
