@@ -72,6 +72,8 @@ def test_energies(folder):
         found = [
             drawn(lambda panel, source=source: uem.plot_energies(source, panel))[0] for source in (book, folder / "energy.csv")
         ]
+    every, _ = drawn(lambda panel: uem.plot_history(folder / "energy.csv", panel))
+    assert {"kinetic", "stored"} <= set(every) and "time" not in every
     for lines in found:
         assert {"kinetic", "stored", "sum less external work"} <= set(lines) <= {"external", *found[0]}
         (t, total), (_, stored) = lines["sum less external work"], lines["stored"]

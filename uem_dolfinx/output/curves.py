@@ -41,7 +41,8 @@ def plot_history(
     Args:
         source: a ``HistoryWriter``, ``ResultsWriter`` or ``EnergyBook``, what ``read_results`` returns, or the path of a CSV file.
         picture: name of the picture, or a panel of :func:`figure`. By default the picture is returned, and Jupyter shows it.
-        columns: their names, see the head of the file; None takes all forces and reactions that are not zero.
+        columns: their names, see the head of the file; None takes all forces and reactions that are not zero, and without any
+            all columns that are not, as the energies of an ``EnergyBook``.
         over: the column on the other axis; None is ``time`` or ``factor``.
         label: of the axis of values; None is the name of a single column.
         over_label: of the other axis; None is ``over``.
@@ -61,7 +62,8 @@ def plot_history(
         given.word("over", over, list(numbers))
         columns = [columns] if isinstance(columns, str) else columns
         if columns is None:
-            columns = [n for n, v in numbers.items() if n.startswith(("force_", "reaction_")) and np.abs(v).max(initial=0.0) > 0]
+            moved = [n for n, v in numbers.items() if n != over and np.abs(v).max(initial=0.0) > 0]
+            columns = [n for n in moved if n.startswith(("force_", "reaction_"))] or moved
         wanted = given.items("columns", columns, lambda one: isinstance(one, str), "the name of a column")
         for name in wanted:
             given.word("columns", name, list(numbers))
