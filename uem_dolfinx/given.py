@@ -116,15 +116,14 @@ def fault(values: Array, shape: tuple[int, ...], within: Range, places: Array | 
 
 def number(what: str, value: Any, within: Range = FINITE) -> float:
     """A number of a range: InputTypeError for anything else, InputError outside of it."""
-    words = sentence(what, value, within.words, within.remedy)
     if symbolic(value) or truth(value) or isinstance(value, (str, bytes)) or np.ndim(value):
-        raise InputTypeError(words)
+        raise InputTypeError(sentence(what, value, within.words, within.remedy))
     try:
         x = float(value)
     except (TypeError, ValueError):
-        raise InputTypeError(words) from None
+        raise InputTypeError(sentence(what, value, within.words, within.remedy)) from None
     if not within.holds(x):
-        raise InputError(words)
+        raise InputError(sentence(what, value, within.words, within.remedy))
     return x
 
 

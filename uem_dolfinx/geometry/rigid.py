@@ -312,7 +312,7 @@ class RigidPlane(RigidSurface):
     def __init__(self, point: npt.ArrayLike, normal: npt.ArrayLike, *, name: str = "rigid plane"):
         p = given.vector("rigid plane: point", point)
         n = given.direction("rigid plane: normal", normal, len(p))
-        super().__init__(lambda x: (x - p) @ n, lambda x: np.tile(n, (len(x), 1)), name=name, reference=p)
+        super().__init__(lambda x: (x - p) @ n, lambda x: n[None].repeat(len(x), axis=0), name=name, reference=p)
 
     def _shape_operator(self, points: Array, normal: Array, length: Array) -> Array:
         """A plane is not curved."""

@@ -16,7 +16,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Bools
+from uem_dolfinx.arrays import AnyArray, Array, Bools
 from uem_dolfinx.dynamics.explicit.part_solver import Prediction, SurfaceSolver
 from uem_dolfinx.errors import InvertedElementError, MassError, StepAccuracyError
 from uem_dolfinx.parallel import gathered, reduced
@@ -78,7 +78,7 @@ STEADY_STRAIN = 0.1
 #: [convention; the least height; test_explicit_materials.py::test_cells_that_collapse]
 COLLAPSED = 1e-3
 #: Cells whose strains are found at once, in arrays that caches hold. [bound; cells; -]
-CELLS_AT_ONCE = 4096
+CELLS_AT_ONCE = 16384
 #: Wave numbers along the axes, times the model's size, of the field that frequencies are sought from. [format; wave numbers; -]
 IRRATIONAL = 1e3 * np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])
 
@@ -110,20 +110,22 @@ class ExplicitStepper:
         self.part = 1.0  # part of the critical step that resolves closed contacts
         config = problem.config
         cell = compat.cell_name(config.mesh)
-        self._vertices = compat.cell_dofs(config.V)[:, : len(forms.reference_topology(cell)[0])]
+        #: Vertices of cells ``(n_vertices, n_cells)``.
+        self._vertices = compat.cell_dofs(config.V)[:, : len(forms.reference_topology(cell)[0])].T.astype(np.intp, order="C")
         # slopes are constant in simplices; other cells collapse first at the outermost points that forces are integrated at
         degrees = [forms.DEGREES_ENOUGH, *(one.metadata().get("quadrature_degree", 0) for one in bodies.F.integrals())]
         points, _ = forms.quadrature_rule(cell, 1 if cell in ("triangle", "tetrahedron") else max(degrees))
         if cell in ("quadrilateral", "hexahedron"):
             points = points[np.isin(points, (points.min(), points.max())).all(axis=1)]
-        #: Derivatives of the shape functions of vertices by reference coordinates ``(tdim, n_points, n_vertices)``.
-        self._derivatives = forms.create_lagrange_element(cell, 1).tabulate(1, points)[1:, :, :, 0]
+        #: Derivatives of the shape functions of vertices by reference coordinates ``(tdim * n_points, n_vertices)``.
+        self._derivatives = np.concatenate(forms.create_lagrange_element(cell, 1).tabulate(1, points)[1:, :, :, 0])
         #: Least height of the cells, and the fastest rate of strain, as last looked at.
         self.shortest, self.rate = np.inf, 0.0
-        #: Cells that are treated at once, and their slopes in the mesh as it was read.
-        self._blocks = [slice(k, k + CELLS_AT_ONCE) for k in range(0, len(self._vertices), CELLS_AT_ONCE)]
-        self._of_mesh = [self._slopes(config.X, cells) for cells in self._blocks]
-        steepest = max((_steepest(_inverse(of)) for of in self._of_mesh), default=0.0)
+        #: Cells that are treated at once, and their slopes in the mesh as it was read, in short numbers: strains need no more.
+        self._blocks = [slice(k, k + CELLS_AT_ONCE) for k in range(0, self._vertices.shape[1], CELLS_AT_ONCE)]
+        of_mesh = [self._slopes(np.array(config.X.T), cells) for cells in self._blocks]
+        steepest = max((_steepest(_inverse(of)) for of in of_mesh), default=0.0)
+        self._of_mesh = [of.astype(np.float32) for of in of_mesh]
         self._least = COLLAPSED / float(reduced(problem.comm, steepest, op=MPI.MAX))
         self.sudden = False  # whether accelerations may have strained cells much in the last step
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
@@ -216,7 +218,8 @@ class ExplicitStepper:
             largest = float(reduced(problem.comm, float(np.abs(a).max(initial=0.0)), op=MPI.MAX))
             self.sudden = 2.0 * largest * dt**2 > CHECKED_STRAIN * self.shortest
             if self.sudden:
-                strain = _strain(_inverse(self._slopes(config.x)), self._slopes(config.X + config.of(problem.committed)))
+                now, then = np.array(config.x.T), np.array((config.X + config.of(problem.committed)).T)
+                strain = _strain(_inverse(self._slopes(now)), self._slopes(then))
                 changed = float(reduced(problem.comm, strain, op=MPI.MAX)) > CHECKED_STRAIN
         if not changed and self.pattern() == before:
             return
@@ -261,13 +264,13 @@ class ExplicitStepper:
         return condensed if stiff else fixed
 
     def _nodal(self, of: Any) -> Array:
-        """Values of a field at nodes ``(n_local, gdim)``."""
-        return np.asarray(of.x.array.reshape(-1, self.problem.config.gdim))
+        """Values of a field at nodes ``(gdim, n_local)``."""
+        return np.array(of.x.array.reshape(-1, self.problem.config.gdim).T)
 
     def _slopes(self, of: Array, cells: slice = slice(None)) -> Array:
-        """Derivatives of nodal values ``(n_local, gdim)`` by reference coordinates, at the points of cells ``(tdim, gdim, n)``."""
-        found = np.tensordot(self._derivatives, of.T[:, self._vertices[cells]], (2, 2)).transpose(0, 2, 1, 3)
-        return np.asarray(found.reshape(*found.shape[:2], -1))
+        """Derivatives of nodal values ``(k, n_local)`` by reference coordinates, at the points of cells ``(tdim, k, n)``."""
+        found = self._derivatives @ of.take(self._vertices[:, cells], axis=1)
+        return np.asarray(found.reshape(len(of), self.problem.config.tdim, -1).transpose(1, 0, 2))
 
     def look(self, stretch: float = np.inf) -> float:
         """Find how fast the velocities strain cells, and their least height (collective).
@@ -281,13 +284,16 @@ class ExplicitStepper:
         Raises:
             InvertedElementError: if the height is a small part of the least one of the mesh.
         """
-        x, v, worst = self.problem.config.x, self._nodal(self.dynamics.velocity), np.zeros(3)
+        # rates per step are far from the ends of the range of short numbers, in any units
+        dt, g, worst = self.problem.step_control.nominal, self.problem.config.gdim, np.zeros(3)
+        both = np.concatenate([self.problem.config.x.T, dt * self._nodal(self.dynamics.velocity)])
         for cells, of_mesh in zip(self._blocks, self._of_mesh):
-            inverse = _inverse(self._slopes(x, cells))
-            found = _rates(inverse, self._slopes(v, cells)).max(), _steepest(inverse), _strain(inverse, of_mesh)
-            worst = np.maximum(worst, found)
-        self.rate, steepest, strain = map(float, reduced(self.problem.comm, worst, op=MPI.MAX))
-        self.shortest = 1.0 / steepest
+            slopes = self._slopes(both, cells)
+            inverse, rates = _inverse(slopes[:, :g]), slopes[:, g:].astype(np.float32)
+            steepest, inverse = _steepest(inverse), inverse.astype(np.float32)
+            worst = np.maximum(worst, (_rates(inverse, rates).max(), steepest, _strain(inverse, of_mesh)))
+        rate, steepest, strain = map(float, reduced(self.problem.comm, worst, op=MPI.MAX))
+        self.rate, self.shortest = rate / dt, 1.0 / steepest
         if self.shortest < self._least:
             raise InvertedElementError(
                 f"cells collapse: their least height, {self._least / COLLAPSED:.3g} at the start, is {self.shortest:.3g}; "
@@ -309,7 +315,7 @@ class ExplicitStepper:
         dynamics = self.dynamics
         if self.problem.bodies.linear or not np.isfinite(critical):
             return np.inf
-        inverse = _inverse(self._slopes(self.problem.config.x))
+        inverse = _inverse(self._slopes(np.array(self.problem.config.x.T)))
         v, a = (_rates(inverse, self._slopes(of)) for of in (self._nodal(dynamics.velocity), self._nodal(dynamics.acceleration)))
         rates = np.hypot(v, 0.5 * critical * a)
         fastest = float(reduced(self.problem.comm, float(rates.max(initial=0.0)), op=MPI.MAX))
@@ -337,19 +343,19 @@ class ExplicitStepper:
         return np.array(P.pass_on(self._times_K(du)).array_r) * self.moving
 
 
-def _steepest(inverse: Array) -> float:
+def _steepest(inverse: AnyArray) -> float:
     """One over the least height of cells, from the inverse ``_slopes`` of positions."""
     return float(np.sqrt(np.square(inverse).sum(axis=0).max(initial=0.0)))
 
 
-def _strain(inverse: Array, since: Array) -> float:
+def _strain(inverse: AnyArray, since: AnyArray) -> float:
     """Largest of Almansi's strains, from the inverse ``_slopes`` of positions and the earlier ``_slopes``."""
     back = np.einsum("itn,tjn->ijn", inverse, since)
-    E = 0.5 * (np.eye(len(back))[:, :, None] - np.einsum("ikn,jkn->ijn", back, back))
+    E = 0.5 * (np.eye(len(back), dtype=back.dtype)[:, :, None] - np.einsum("ikn,jkn->ijn", back, back))
     return float(np.sqrt(np.einsum("ijn,ijn->n", E, E).max(initial=0.0)))
 
 
-def _rates(inverse: Array, of: Array) -> Array:
+def _rates(inverse: AnyArray, of: AnyArray) -> AnyArray:
     """Rates of strain ``(n,)`` from the inverse ``_slopes`` of positions and the ``_slopes`` of nodal rates."""
     L = np.einsum("itn,tjn->ijn", inverse, of)
     # turning does not strain
@@ -359,10 +365,9 @@ def _rates(inverse: Array, of: Array) -> Array:
 
 def _inverse(A: Array) -> Array:
     """Inverses of matrices ``(g, g, n)``, by cofactors: a library's loop over small matrices takes ten times as long."""
-    if len(A) == 2:
-        cofactors = A[::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]])[:, :, None]
-    else:
-        i, j = np.arange(3) - 2, np.arange(3) - 1
-        B, C = A[i], A[j]
-        cofactors = B[:, i] * C[:, j] - B[:, j] * C[:, i]
-    return np.asarray(cofactors.transpose(1, 0, 2) / (A[0] * cofactors[0]).sum(axis=0))
+    g, minors = len(A), np.empty(A.shape)
+    for i, j in np.ndindex(g, g):
+        # of rows and columns that follow each other in turn, without signs
+        a, b, k, m = A[i - g + 1], A[i - g + 2], j - g + 1, j - g + 2
+        minors[j, i] = a[k] * b[m] - a[m] * b[k] if g == 3 else (-1.0) ** (i + j) * a[k]
+    return np.asarray(minors / np.einsum("jn,jn->n", A[0], minors[:, 0]))

@@ -40,8 +40,8 @@ class LinearForces:
         #: Values of Constants and Functions at the last call, and F(0) with them; None until it is needed.
         self._values: list[Array] | None = None
         self._at_zero: Array | None = None
-        #: State of K's values, their forces in translations, and the number of nodes of each body.
-        self._state = -1
+        #: State of K's values, whether translations meet forces, these, and the number of nodes of each body.
+        self._state, self._resists = -1, False
         self._resistance = self._sizes = np.zeros(0)
 
     def assemble(self, b: PETSc.Vec) -> None:
@@ -72,13 +72,15 @@ class LinearForces:
         body, g = body[: config.n_owned], config.gdim
         if state != self._state:
             self._state, self._resistance = state, resistance_to_translation(K, config.unknowns)
+            self._resists = bool(self._resistance.any())
             self._sizes = reduced(config.comm, np.bincount(body, minlength=count).astype(float))
         u = bodies.displacement()
         x = u.array.reshape(-1, g)
         sums = reduced(config.comm, np.column_stack([np.bincount(body, x[:, i], count) for i in range(g)]))
         mean = (sums / self._sizes[:, None])[body]
         u.array[:] -= mean.ravel()
-        return np.asarray(forms.product(K, u).array_r + (self._resistance * mean.repeat(g, axis=0)).sum(axis=1))
+        found = np.asarray(forms.product(K, u).array_r)
+        return found + (self._resistance * mean.repeat(g, axis=0)).sum(axis=1) if self._resists else found
 
 
 def resistance_to_translation(K: PETSc.Mat, space: Nodes) -> Array:
