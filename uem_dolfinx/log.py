@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import logging
 import sys
-from contextlib import ContextDecorator, contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from contextlib import contextmanager
+from functools import wraps
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -18,9 +19,10 @@ from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 T = TypeVar("T")
+F = TypeVar("F", bound="Callable[..., Any]")
 
 
 logger = logging.getLogger("uem_dolfinx")
@@ -47,22 +49,24 @@ STAGES = (
 _stages: dict[str, None] = {}
 
 
-class timed(ContextDecorator):  # noqa: N801
-    """Time a stage of the method, as ``"search"``, as a context or a decorator; ``list_timings`` shows it as ``~UEM: search``."""
+def timed(stage: str) -> Timer:
+    """A context that times a stage of the method, as ``"search"``; ``list_timings`` shows it as ``~UEM: search``."""
+    _stages[stage] = None
+    return Timer(f"~UEM: {stage}")
 
-    def __init__(self, stage: str):
-        self._stage = stage
 
-    def _recreate_cm(self) -> timed:
-        return timed(self._stage)
+def timed_as(stage: str) -> Callable[[F], F]:
+    """Decorator of a function whose calls are a stage, see ``timed``."""
 
-    def __enter__(self) -> None:
-        _stages[self._stage] = None
-        self._timer = Timer(f"~UEM: {self._stage}")
-        self._timer.__enter__()
+    def decorated(function: F) -> F:
+        @wraps(function)
+        def run(*args: Any, **how: Any) -> Any:
+            with timed(stage):
+                return function(*args, **how)
 
-    def __exit__(self, *error: object) -> None:
-        self._timer.__exit__(*error)
+        return cast("F", run)
+
+    return decorated
 
 
 class Timings(dict[str, tuple[int, float]]):

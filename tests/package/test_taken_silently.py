@@ -129,7 +129,7 @@ def test_stages_are_all_there():
     found = set()
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "timed":
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("timed", "timed_as"):
                 found |= {
                     one.value for one in ast.walk(node.args[0]) if isinstance(one, ast.Constant) and isinstance(one.value, str)
                 }

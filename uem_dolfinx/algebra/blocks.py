@@ -224,7 +224,8 @@ def rows_are_symmetric(A: PETSc.Mat, space: Nodes) -> bool:
     A acts on ``space``. The diagonal of other fields may be zero: it is then replaced by the row's largest entry over the root of the
     largest diagonal entry.
     """
-    size, one, other = (space.vector() for _ in range(3))
+    size = space.vector()
+    one, other = size.duplicate(), size.duplicate()
     A.getDiagonal(size)
     root = np.sqrt(np.abs(size.array_r))
     if space.mixed:

@@ -31,7 +31,7 @@ from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import on_root, reduced
 
-#: A sparse factorisation takes as long, beside its arithmetic, as so many floating-point operations for each unknown.
+#: A sparse factorisation takes as long, in addition to its arithmetic, as so many floating-point operations for each unknown.
 #: [heuristic; operations; test_condensed.py::test_which_way_is_cheaper]
 FOR_EACH_UNKNOWN = 30_000
 

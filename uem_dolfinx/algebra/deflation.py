@@ -25,7 +25,7 @@ from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.geometry.bodies import find_bodies
 from uem_dolfinx.geometry.nodes import Nodes
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import gathered, reduced
 
 #: Contactors that make the stiffness of a node they press on larger by this factor are much stiffer than their target.
@@ -84,7 +84,7 @@ class Deflation:
         self.W.multAdd(moved, y, y)
 
 
-@timed("deflation")
+@timed_as("deflation")
 def in_deflation(pc: PETSc.PC, space: Nodes, A: PETSc.Mat, P: Restriction, pressed: Bools) -> PETSc.PC:
     """Deflated preconditioner of A with multigrid ``pc``, which excludes nodes ``pressed (n_owned,)`` by stiff bodies (collective)."""
     pc.setOperators(without(space, A, P, pressed))
@@ -93,7 +93,7 @@ def in_deflation(pc: PETSc.PC, space: Nodes, A: PETSc.Mat, P: Restriction, press
     return PETSc.PC().createPython(deflation, comm=space.comm)
 
 
-@timed("deflation")
+@timed_as("deflation")
 def pressed_hard(space: Nodes, A: PETSc.Mat, K: PETSc.Mat, P: Restriction) -> Bools:
     """Mask of owned nodes whose stiffness is mostly due to contactors that follow them ``(n_owned,)``."""
     followed = np.zeros(space.n_owned, dtype=bool)

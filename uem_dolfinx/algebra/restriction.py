@@ -75,8 +75,8 @@ class Restriction:
         self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift, error = self._eliminate() if like is None else self._eliminate_like(like)
         terms = equations.active[equations.row].sum()
-        told = np.array([equations.active.sum(), len(equations), terms, error is not None], dtype=np.int64)
-        self.n_equations, self._n_rows, self._n_terms, wrong = (int(k) for k in reduced(self.comm, told))
+        sums = np.array([equations.active.sum(), len(equations), terms, error is not None], dtype=np.int64)
+        self.n_equations, self._n_rows, self._n_terms, wrong = reduced(self.comm, sums).tolist()
         if wrong:
             agree(self.comm, error)
         self.used: Bools = free.copy()  # columns of P that are in use ``(n_owned, block)``
@@ -214,7 +214,7 @@ class Restriction:
         if self.chain == 0:
             return T
         assert self._halo is not None
-        M, asked = self._couplings(self.equations.active), self._follows
+        M = self._couplings(self.equations.active)
         # T is block-diagonal
         turned = self._halo.take(lambda i: self._turned(i).value)
         terms, power = [T], Blocks(M.row, M.column, M.value @ turned[self._term])
@@ -224,7 +224,7 @@ class Restriction:
                 return summed(together(*terms))
             if self.fades:
                 power = power.some((np.abs(power.value) > FADED).any(axis=(1, 2)))
-            power = product(M, rows_at(self.space, power, asked))
+            power = product(M, rows_at(self.space, power, self._follows))
 
     def rows_of(self, nodes: npt.NDArray[np.integer]) -> Blocks:
         """Rows of P at owned nodes ``(k,)``, which must include all eliminated nodes (collective)."""
@@ -237,7 +237,7 @@ class Restriction:
     @property
     def followed_here(self) -> Ints:
         """Local numbers of the owned nodes that active equations of any rank follow, possibly repeated."""
-        return np.zeros(0, np.int64) if self._halo is None else self._halo.asked
+        return np.zeros(0, np.int64) if self._halo is None else self._halo.needed
 
     def followed(self, which: Bools) -> Ints:
         """Global nodes that some of the equations follow, each once."""

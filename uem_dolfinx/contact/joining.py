@@ -19,7 +19,6 @@ from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.tags import Tag
 
 if TYPE_CHECKING:
-    from uem_dolfinx.contact.contact import Contact
     from uem_dolfinx.contact.further.part import FurtherPart
     from uem_dolfinx.contact.pair.interface import Interface
     from uem_dolfinx.contact.pair.kinds import PartsOfPair

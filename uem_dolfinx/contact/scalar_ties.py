@@ -90,8 +90,8 @@ class ScalarTie:
         able[found.row[(sizes(config, found, free) > 0).any(axis=1)]] = True
         self._rows = found.select(able)
         followed = np.zeros(config.n_owned, dtype=bool)
-        followed[Halo(config, theirs).asked] = True
-        followed[Halo(config, own).asked] = False
+        followed[Halo(config, theirs).needed] = True
+        followed[Halo(config, own).needed] = False
         #: owned nodes of the target, eliminated only in equations without another node to eliminate.
         self.followed: Indices = np.flatnonzero(followed).astype(np.int32)
 

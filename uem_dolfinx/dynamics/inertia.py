@@ -25,7 +25,7 @@ from uem_dolfinx.dynamics.scheme import CentralDifferences, Scheme, newmark
 from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
 if TYPE_CHECKING:
@@ -301,7 +301,7 @@ class Dynamics(given.Sealed):
             if rate is not None:
                 self._rate.value = rate
 
-    @timed("inertia forces")
+    @timed_as("inertia forces")
     def load(self) -> Array | None:
         """Inertia forces, which explicit steps find from others, minus weight, to add to residuals ``(n,)``; None for zero (collective)."""
         if self.moving and self.scheme.explicit:

@@ -26,7 +26,7 @@ from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.bodies import body_sums, find_bodies, rigid_velocities
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR
 from uem_dolfinx.geometry.configuration import Configuration, configuration_of
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed, timed_as
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
 
@@ -391,7 +391,7 @@ def lumped_mass(V: fem.FunctionSpace, rho: Any) -> Mass:
     return Mass(_diagonal(config, np.repeat(m, config.gdim)), config, diagonal=True, density=density)
 
 
-@timed("assemble mass")
+@timed_as("assemble mass")
 def nodal_mass(V: fem.FunctionSpace, values: npt.ArrayLike | Callable[[Array], npt.ArrayLike]) -> Mass:
     """Masses given at the nodes (collective).
 

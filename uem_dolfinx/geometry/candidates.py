@@ -16,7 +16,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, Ints
 from uem_dolfinx.geometry.shapes import FacetShape, unit_normals
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 
 #: Facets whose distances differ by less are equally near, and those whose heights do are faced alike.
 #: [convention; part of the distance; test_thresholds_geometry.py::test_facets_equally_near]
@@ -26,7 +26,7 @@ EQUALLY_NEAR = 1e-9
 ALL_PAIRS = 2**15
 
 
-@timed("search")
+@timed_as("search")
 def candidate_pairs(
     shape: FacetShape, x: Array, points: Array, asked: Ints | None = None, surface: Ints | None = None
 ) -> tuple[Ints, Ints]:

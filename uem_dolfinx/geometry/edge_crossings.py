@@ -20,7 +20,7 @@ from uem_dolfinx.geometry.edge_gaps import EdgeGaps, cubics, may_cross
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.nodes import Halo
 from uem_dolfinx.geometry.sharp import SHARP_EDGE, pairs_of_equals, sharp_edges
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
 
 #: Edges nearer to each other than this are opposite, and no deeper inside each other.
@@ -157,7 +157,7 @@ class Opposite(NamedTuple):
     facet_nodes: Ints  # global numbers of its nodes ``(k, nn)``
     facet_x: Array  # their positions ``(k, nn, 3)``
     key: Ints  # of both pieces, independent of the partition ``(k, 2)``
-    told: Ints  # visibility keys of both ``(k, 2 m)``
+    visibility: Ints  # visibility keys of both ``(k, 2 m)``
 
     @property
     def gaps(self) -> EdgeGaps:
@@ -212,8 +212,8 @@ class Crossings:
     def hold(self, nodes: Indices, body: Ints, n_bodies: int) -> Bools:
         """Which owned ``nodes (n,)`` are at crossings with edges of a ``body (n,)`` each; keys end with the body (collective)."""
         self.update()
-        there, told = self.at_crossings
-        return np.isin(nodes * n_bodies + body, there * n_bodies + told[:, -1]) & (body >= 0)
+        there, visibility = self.at_crossings
+        return np.isin(nodes * n_bodies + body, there * n_bodies + visibility[:, -1]) & (body >= 0)
 
     def update(self) -> None:
         """Find the crossings at the present positions (collective)."""
@@ -226,7 +226,7 @@ class Crossings:
             self._made_at = x, self.held.copy()
             self._make()
 
-    @timed("search")
+    @timed_as("search")
     def _make(self) -> None:
         config = self._config
         found = self._found()
@@ -262,15 +262,15 @@ class Crossings:
         """Collect the nodes that lie at crossings, of both sides (collective)."""
         nodes, keys = [], []
         for _, found in self.lists:
-            half = found.told.shape[1] // 2
-            sides = (found.nodes, found.told[:, half:]), (found.followed, found.told[:, :half])
-            for weights, (own, told) in zip(found.gaps.weights, sides):
+            half = found.visibility.shape[1] // 2
+            sides = (found.nodes, found.visibility[:, half:]), (found.followed, found.visibility[:, :half])
+            for weights, (own, visibility) in zip(found.gaps.weights, sides):
                 middle = np.array([False, True, True, False])
                 k, a = np.nonzero(found.leads[:, None] & ((weights >= 1.0 - AT_NODE) | (found.ridges[:, None] & middle)))
                 nodes.append(own[k, a])
-                keys.append(told[k])
-        there, told = np.concatenate(nodes), np.concatenate(keys)
-        arrived, their = Exchange.to(self._config.comm, self._config.owner_of(there)).send(there, told)
+                keys.append(visibility[k])
+        there, visibility = np.concatenate(nodes), np.concatenate(keys)
+        arrived, their = Exchange.to(self._config.comm, self._config.owner_of(there)).send(there, visibility)
         self.at_crossings = arrived - self._config.first, their
 
     def _found(self) -> Opposite:
@@ -284,14 +284,14 @@ class Crossings:
         (c, r), (d, q) = _balls(x), _balls(y)
         box = np.stack([(d - q[:, None]).min(axis=0, initial=np.inf), (d + q[:, None]).max(axis=0, initial=-np.inf)])
         rows = [np.flatnonzero(((c - r[:, None] <= b[1]) & (c + r[:, None] >= b[0])).all(axis=1)) for b in gathered(comm, box)]
-        x, before, cubic, normals, nodes, key, told, ends = Exchange(comm, rows).send(
+        x, before, cubic, normals, nodes, key, visibility, ends = Exchange(comm, rows).send(
             x, before, one.cubics, normals, one.nodes, one.keys, self._keys[0], one.ends
         )
         i, j = np.zeros((2, 0), np.int64)
         if len(x) and len(y):
             i, j = balls_that_meet(*_balls(x), d, q)
             apart = (nodes[i][:, 1:3, None] != other.nodes[j][:, None, 1:3]).all(axis=(1, 2))
-            some = np.flatnonzero(apart & self._meet(told[i], self._keys[1][j]))
+            some = np.flatnonzero(apart & self._meet(visibility[i], self._keys[1][j]))
             i, j = i[some], j[some]
             near = may_cross(x[i], y[j], EDGES_PARALLEL)
             i, j = i[near], j[near]
@@ -302,14 +302,14 @@ class Crossings:
         fits = fits[self._in_front(gaps.take(fits), before[i[fits]], behind[j[fits]])]
         i, j, gaps, within, ends, facets = i[fits], j[fits], gaps.take(fits), within[fits], ends[fits], other.facets
         f, second, ridges = other.facet[j], gaps.s > FIRST_NODE, within > RIDGES
-        told, keys = np.concatenate([told[i], self._keys[1][j]], axis=1), np.column_stack([key[i], other.keys[j]])
+        visibility, keys = np.concatenate([visibility[i], self._keys[1][j]], axis=1), np.column_stack([key[i], other.keys[j]])
         both = []
         for leads, own in ((True, np.where(second, 2, 1)), (False, np.where(second, 1, 2))):
             both.append(
                 Opposite(
                     nodes[i, own], own, np.full(len(i), leads), ridges, gaps.s, gaps.t, gaps.x, gaps.y, *gaps.cubics,
                     gaps.normal, nodes[i], other.nodes[j], ends, f + facets.first[comm.rank], other.on_facet(j, gaps.t),
-                    facets.nodes[f], facets.x[f], keys, told,
+                    facets.nodes[f], facets.x[f], keys, visibility,
                 )
             )  # fmt: skip
         found = Opposite._make(np.concatenate(parts) for parts in zip(*both))

@@ -108,8 +108,8 @@ def raw_of(found: Found, path: Path, gdim: int | None = None, simplices: bool = 
         from uem_dolfinx.geometry.simplices import divided
 
         found, before = divided(found, str(path))
-        told = ", ".join(f"{n} {kind}" for kind, n in before.items())
-        logger.info("%s: %s are divided into %d simplices", path, told, sum(len(block.data) for block in found.bodies))
+        counts = ", ".join(f"{n} {kind}" for kind, n in before.items())
+        logger.info("%s: %s are divided into %d simplices", path, counts, sum(len(block.data) for block in found.bodies))
     dim, kinds = found.dim, sorted({block.type for block in found.bodies})
     if len(kinds) != 1 or kinds[0] not in MESHIO_CELLS:
         remedy = (
@@ -159,8 +159,8 @@ def _found(path: Path, nodes: Sequence[int]) -> Found:
             return from_meshio(meshio.read(path), path.suffix == ".msh")
     # for files that it cannot read, meshio raises various exceptions, or SystemExit without a reader
     except (Exception, SystemExit) as error:
-        told = " ".join(said.getvalue().split()) or str(error)
-        raise MeshError(f"meshio cannot read {path}: {told}") from error
+        reason = " ".join(said.getvalue().split()) or str(error)
+        raise MeshError(f"meshio cannot read {path}: {reason}") from error
 
 
 def _sets_of_cells(found: Found, place: Ints) -> Iterator[Group]:

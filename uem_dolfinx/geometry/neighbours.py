@@ -24,7 +24,7 @@ from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.search import Feet, MeshTarget
 from uem_dolfinx.geometry.shapes import closest_point
 from uem_dolfinx.geometry.skin import Apart, Skin
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import Exchange, gathered, reduced
 
 #: Lists reach so far ahead of every body, if it hardly moves.
@@ -153,7 +153,7 @@ class Neighbours:
         self._farther, self._made_at = 4.0 * max(self._farther, float(self._reach.max(initial=0.0))), None
         return True
 
-    @timed("search")
+    @timed_as("search")
     def _make(self) -> None:
         skin, config, comm = self.skin, self._config, self._config.comm
         motion = reduced(comm, np.maximum(self._motion(self._committed), self._last_motion), op=MPI.MAX)
@@ -171,8 +171,8 @@ class Neighbours:
             points, self._committed[self.nodes], config.X[self.nodes], reach, own, config.to_global(self.nodes),
             skin.corners[self.nodes], skin.cones(self.nodes), self.sides, self.held.T,
         )  # fmt: skip
-        *told, rows = exchange.send(*about, np.arange(n))
-        node, facet, cosine, *about_pairs = self._pairs(Asking(*told))
+        *arrived, rows = exchange.send(*about, np.arange(n))
+        node, facet, cosine, *about_pairs = self._pairs(Asking(*arrived))
         home, row = exchange.origins[node], rows[node]
         # the rank of the node decides on the list of each pair, and on the sides of facets beyond which no facet is listed
         meeting, first = Exchange.to(comm, home), self.skin.first[comm.rank]
@@ -365,22 +365,22 @@ class Neighbour(MeshTarget):
         last = n.place[n.skin.size > 0].max()
         return np.asarray((n.place[n.skin.body_of_node[n.nodes]] < last) & (self.number == 0))
 
-    def told(self, which: Ints) -> Ints:
+    def visibility_keys(self, which: Ints) -> Ints:
         """Visibility keys of contactors: position of their body in the order, body, global node and sets ``(k, 3 + s)``."""
         n, nodes = self.neighbours, self.neighbours.nodes[which]
         body = n.skin.body_of_node[nodes]
         return np.column_stack([n.place[body], body, n.skin.config.to_global(nodes), n.sides[which]])
 
-    def may_touch(self, told: Ints, facet: Ints) -> Bools:
-        """Whether this rank's facets ``(k,)`` belong to bodies that the contactors with keys ``told`` follow."""
+    def may_touch(self, visibility: Ints, facet: Ints) -> Bools:
+        """Whether this rank's facets ``(k,)`` belong to bodies that the contactors with keys ``visibility`` follow."""
         n = self.neighbours
-        return np.asarray((n.place[n.skin.body[facet]] > told[:, 0]) & ~n.excluded(told[:, 3:] > 0, facet))
+        return np.asarray((n.place[n.skin.body[facet]] > visibility[:, 0]) & ~n.excluded(visibility[:, 3:] > 0, facet))
 
-    def of_itself(self, told: Ints, facet: Ints) -> Bools:
-        """Whether this rank's facets ``(k,)`` belong to the contactor's own body, but not to the contactor, from keys ``told``."""
+    def of_itself(self, visibility: Ints, facet: Ints) -> Bools:
+        """Whether this rank's facets ``(k,)`` belong to the contactor's own body, but not to the contactor, from keys ``visibility``."""
         n = self.neighbours
-        others = (n.skin.body[facet] == told[:, 1]) & (n.skin.nodes[facet] != told[:, 2, None]).all(axis=1)
-        return np.asarray(others & ~n.excluded(told[:, 3:] > 0, facet))
+        others = (n.skin.body[facet] == visibility[:, 1]) & (n.skin.nodes[facet] != visibility[:, 2, None]).all(axis=1)
+        return np.asarray(others & ~n.excluded(visibility[:, 3:] > 0, facet))
 
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
         """Closest points of contactors on the listed facets; ``nowhere`` for contactors without any (collective)."""

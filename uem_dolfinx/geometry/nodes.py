@@ -187,17 +187,17 @@ class Halo:
     def __init__(self, space: Nodes, nodes: Ints):
         self._space, self._size = space, len(nodes)
         self._exchange = Exchange.to(space.comm, space.owner_of(nodes))
-        (asked,) = self._exchange.send(nodes)
-        self.asked: Ints = asked - space.first  # local numbers of the owned nodes that other ranks need, with repetitions
+        (needed,) = self._exchange.send(nodes)
+        self.needed: Ints = needed - space.first  # local numbers of the owned nodes that ranks need, with repetitions
 
     def take(self, values: Callable[[Ints], Array]) -> Array:
         """Values of the owners at the nodes ``(m, ...)``, from ``values`` at their local nodes ``(k,)``, rows of any shape (collective)."""
-        (told,) = self._exchange.back(values(self.asked))
-        out = np.empty((self._size, *told.shape[1:]), told.dtype)
-        out[self._exchange.rows] = told
+        (arrived,) = self._exchange.back(values(self.needed))
+        out = np.empty((self._size, *arrived.shape[1:]), arrived.dtype)
+        out[self._exchange.rows] = arrived
         return out
 
     def add(self, values: Array) -> Array:
         """Sums of ``values (m, k)`` of all ranks at their owners ``(n_owned, k)`` (collective)."""
         (arrived,) = self._exchange.send(values)
-        return sums_of_rows(self.asked, arrived, self._space.n_owned)
+        return sums_of_rows(self.needed, arrived, self._space.n_owned)

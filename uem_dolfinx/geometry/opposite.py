@@ -14,7 +14,7 @@ from uem_dolfinx.geometry.candidates import balls_that_meet
 from uem_dolfinx.geometry.overlaps import Planes, overlap
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import FacetShape
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import Exchange
 
 #: Facets face each other if the cosine of the angle between one's normal and the other's reversed is larger.
@@ -36,9 +36,14 @@ class Opposite:
     key: Ints  # of the target facet, independent of the partition ``(k,)``
 
 
-@timed("search")
+@timed_as("search")
 def find_opposite(
-    target: MeshTarget, planes: Planes, x: Array, reach: Array, faced: tuple[Ints, Ints] | None = None, told: Array | None = None
+    target: MeshTarget,
+    planes: Planes,
+    x: Array,
+    reach: Array,
+    faced: tuple[Ints, Ints] | None = None,
+    visibility: Array | None = None,
 ) -> Opposite:
     """Target facets that face contactor facets and may lie upon them, no farther than ``reach (m,)`` along the normal (collective).
 
@@ -49,21 +54,21 @@ def find_opposite(
         reach: lengths ``(m,)``.
         faced: keys of the contactor facets, independent of the partition ``(m,)``, and pairs of keys of contactor and target facets
             that have faced each other before ``(p, 2)``; None without such pairs.
-        told: keys that decide which target facets they may touch, see ``MeshTarget.allowed`` ``(m, k)``; None allows all.
+        visibility: keys that decide which target facets they may touch, see ``MeshTarget.allowed`` ``(m, k)``; None allows all.
     """
     comm = target.comm
     middle = x.mean(axis=1)
     radius = np.linalg.norm(x - middle[:, None], axis=2).max(axis=1, initial=0.0)
     here = target.facets.x
     asked = [middle, radius, reach, planes.normal]
-    told = np.zeros((len(x), 0)) if told is None else told
+    visibility = np.zeros((len(x), 0)) if visibility is None else visibility
     if comm.size == 1:
-        i, f = _allowed(target, told, *_candidates(target, here, *asked))
+        i, f = _allowed(target, visibility, *_candidates(target, here, *asked))
         return _facing(target.shape, planes, faced, i, here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     exchange = Exchange(comm, target.boxes(here).near(middle, radius + reach))
     mine = np.arange(len(x))
-    *arrived, told, row, rank = exchange.send(*asked, told, mine, np.full(len(x), comm.rank))
-    i, f = _allowed(target, told, *_candidates(target, here, *arrived))
+    *arrived, visibility, row, rank = exchange.send(*asked, visibility, mine, np.full(len(x), comm.rank))
+    i, f = _allowed(target, visibility, *_candidates(target, here, *arrived))
     found = Exchange.to(comm, rank[i]).send(row[i], here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     return _facing(target.shape, planes, faced, *found)
 
@@ -82,11 +87,11 @@ def thickness(target: MeshTarget, most: float) -> Array:
     return thick
 
 
-def _allowed(target: MeshTarget, told: Array, facet: Ints, opposite: Ints) -> tuple[Ints, Ints]:
-    """The pairs of facets that may touch each other, by the keys ``told (m, k)`` of the contactor facets."""
-    if not told.shape[1]:
+def _allowed(target: MeshTarget, visibility: Array, facet: Ints, opposite: Ints) -> tuple[Ints, Ints]:
+    """The pairs of facets that may touch each other, by the keys ``visibility (m, k)`` of the contactor facets."""
+    if not visibility.shape[1]:
         return facet, opposite
-    may = target.allowed(told[facet], opposite)
+    may = target.allowed(visibility[facet], opposite)
     return facet[may], opposite[may]
 
 

@@ -14,7 +14,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints, replace
 #: A way from the foot that is shorter, in lengths of the facet, or leans from its normal by less, is rounding.
 #: [bound; cosine, and length of the facet; test_offset_edges.py::test_points_on_their_feet]
 ALONG_NORMAL = 1e-12
-#: Facets go on below points that are behind an edge and beside them by less than this part of their depth; at sharper edges, which hold
+#: Facets go on below points that are behind an edge, and to the side by less than this part of their depth; at sharper edges, which hold
 #: points by both facets, they do not. [convention; slope; test_behind_edges.py::test_shallow_edges]
 SHALLOW = 0.25
 #: Offsets of less than this part of the facet do not round a convex edge: Newton's steps are longer than such an arc.

@@ -45,10 +45,10 @@ class OfPoints:
             x = _places(points)
             try:
                 with np.errstate(all="ignore"):
-                    told = np.shape(self._distance(x)) == (x.shape[1],)
+                    takes_rows = np.shape(self._distance(x)) == (x.shape[1],)
             except Exception:  # of a function of points, or one that raises for these as well
-                told = False
-            if not told:
+                takes_rows = False
+            if not takes_rows:
                 return False
             self._of_places = True
         return self._of_places

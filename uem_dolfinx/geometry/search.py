@@ -151,16 +151,16 @@ class MeshTarget:
         """Keys of the facets numbered ``facet (n,)``, -1 for -1 (collective; see ``TargetFacets.keys``)."""
         return self.of_facets(facet, self.facets.keys)
 
-    def told(self, which: Ints) -> Ints:
+    def visibility_keys(self, which: Ints) -> Ints:
         """Visibility keys of the contactors ``which (k,)``: zeros, since they may touch all facets ``(k,)``."""
         return np.zeros(len(which), np.int64)
 
-    def may_touch(self, told: Ints, facet: Ints) -> Bools:
-        """Whether contactors with keys ``told (k,)`` may touch this rank's facets ``(k,)``."""
-        return np.ones(len(told), bool)
+    def may_touch(self, visibility: Ints, facet: Ints) -> Bools:
+        """Whether contactors with keys ``visibility (k,)`` may touch this rank's facets ``(k,)``."""
+        return np.ones(len(visibility), bool)
 
-    def allowed(self, told: Array, facet: Ints) -> Bools:
-        """Whether contactor facets with keys ``told (k, m)`` may touch this rank's facets ``(k,)``."""
+    def allowed(self, visibility: Array, facet: Ints) -> Bools:
+        """Whether contactor facets with keys ``visibility (k, m)`` may touch this rank's facets ``(k,)``."""
         return np.ones(len(facet), bool)
 
     def of_facets(self, facet: Ints, values: AnyArray) -> Any:
@@ -372,12 +372,12 @@ def nearest_of(comm: MPI.Comm, points: Array, places: Array, within: float, valu
         Distances ``(n,)``, infinite if no position is near, and values ``(n, k)``, zero there.
     """
     sent = RankBoxes(comm, points).near(places, np.full(len(places), within * (1 + EQUALLY_NEAR)))
-    there, told = Exchange(comm, sent).send(places, values)
+    there, arrived = Exchange(comm, sent).send(places, values)
     distance, found = np.full(len(points), np.inf), np.zeros((len(points), values.shape[1]))
     if len(there) and len(points):
         from scipy.spatial import cKDTree
 
         length, which = cKDTree(there).query(points)
         i = length <= within
-        distance[i], found[i] = length[i], told[which[i]]
+        distance[i], found[i] = length[i], arrived[which[i]]
     return distance, found

@@ -20,7 +20,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.errors import InputError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import centre_of_mass, displacement_gradient
 from uem_dolfinx.geometry.tags import Part
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed, timed_as
 from uem_dolfinx.materials.elastic import KINDS, POISSON, Kind, check_kind, green_lagrange
 from uem_dolfinx.materials.quadrature_points import QuadraturePoints, owned_cells
 from uem_dolfinx.materials.return_mapping import Returned, plane_stress_return, radial_return
@@ -384,7 +384,7 @@ class VonMises(given.Sealed):
         """Trace of the strain at the pressure points ``(n_cells, n_pressure_points)``."""
         return self._pressure_points.evaluate(self._volume_change).reshape(self._pressure_points.volumes.shape)
 
-    @timed("commit history")
+    @timed_as("commit history")
     def commit(self) -> None:
         """Make the state of the last ``update`` the history (collective)."""
         for f, values in zip(self.history.values(), (self._trial.plastic_strain, self._trial.peeq)):

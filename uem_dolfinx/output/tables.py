@@ -20,7 +20,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.results import ManyContacts
 from uem_dolfinx.errors import CheckpointError, InputError, OutputError, UEMError
 from uem_dolfinx.files import OwnFile, begin_file, given_path, in_use, keep_aside, new_folder, on_rank_0
-from uem_dolfinx.log import logger, timed
+from uem_dolfinx.log import logger, timed_as
 from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.solve.problem import UnitedProblem
 
@@ -172,7 +172,7 @@ class CsvTable(Closing):
                 "call checkpoint.begin(problem.state()) before you make what writes with resume=True"
             )
 
-    @timed("write table")
+    @timed_as("write table")
     def write(self, *rows: Sequence[Any]) -> None:
         """Append a row, or several at once; floats are written to the last bit (collective).
 

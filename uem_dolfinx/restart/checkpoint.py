@@ -305,7 +305,9 @@ class Checkpoint(given.Sealed):
             self.check(*state.functions.values())
         self._state, comm, found = state, state.comm, False
         prepare_meeting(state.mesh.comm)
-        trouble = _trouble(comm, f"what a killed run left beside {self.path} cannot be removed", "check the rights of the folder")
+        trouble = _trouble(
+            comm, f"what a killed run left next to {self.path} cannot be removed", "check the rights of the folder"
+        )
         with trouble:
             if comm.rank == 0:
                 _beside(self.path).unlink(missing_ok=True)

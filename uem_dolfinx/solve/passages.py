@@ -147,7 +147,9 @@ def _through_mesh(pair: Interface, target: MeshTarget, start: Array, du: Array, 
     from uem_dolfinx.geometry.crossings import cross_target
 
     x, ends = points[near], target.facets.x
-    found = cross_target(target, near, (x - way[near], x), (ends - moved, ends), reach, target.told(near), target.may_touch)
+    found = cross_target(
+        target, near, (x - way[near], x), (ends - moved, ends), reach, target.visibility_keys(near), target.may_touch
+    )
     entry, out, inside = _inside(found, length[found.point], reach, moving & ~pair.trial.active)
     np.maximum.at(depth, found.point[entry], inside)
     # contactors that leave without having entered began inside, or on a curved facet outside its flat pieces
@@ -206,7 +208,7 @@ def _through_itself(pair: Interface, target: Neighbour, du: Array, moving: bool)
 
     reach, nodes = PASSAGE_DEPTH * target.stride, pair.nodes[which]
     found = cross_target(
-        target, which, (before[nodes], now[nodes]), (before[target.dofs], now[target.dofs]), reach, target.told(which),
+        target, which, (before[nodes], now[nodes]), (before[target.dofs], now[target.dofs]), reach, target.visibility_keys(which),
         target.of_itself, turning=True,
     )  # fmt: skip
     entry, _, inside = _inside(found, found.way, reach, moving & ~pair.trial.active)

@@ -212,7 +212,7 @@ def newton_of(newton: Any, **others: Any) -> Newton:
     """The settings of a problem: a ``Newton``, or a word and the others one by one.
 
     Raises:
-        InputError: for other arguments beside a ``Newton``.
+        InputError: for other arguments in addition to a ``Newton``.
         InputTypeError, InputError: see ``Newton``.
     """
     if not isinstance(newton, Newton):

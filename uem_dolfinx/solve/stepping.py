@@ -230,7 +230,7 @@ def between_steps(
         CheckpointError: if the checkpoint cannot be written. On any other error, and if the caller leaves the loop, the last
             committed state is written, too.
     """
-    told = comm.bcast(logger.isEnabledFor(logging.INFO))
+    logs = comm.bcast(logger.isEnabledFor(logging.INFO))
     outer = progress.interruption, progress.end
     progress.interruption = Interruption() if checkpoint is None else checkpoint.interruption
     loop = object()  # this loop, for the checkpoint
@@ -240,7 +240,7 @@ def between_steps(
         with progress.interruption:
             try:
                 for step in steps:
-                    if told:
+                    if logs:
                         logger.info("%s", step.summary(contacts))
                     # steps are frozen, except for this attribute
                     object.__setattr__(step, "_of_problem", progress.number)

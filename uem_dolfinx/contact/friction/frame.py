@@ -48,18 +48,18 @@ class Frame:
             normals = np.concatenate([normals, c.axes_of(n)], axis=1)
             cornered[c.which] = True
         free = np.ones((n, g), dtype=bool)
-        every = told = stick_slip.tangents(normals, free)
+        every = free_tangents = stick_slip.tangents(normals, free)
         if prescribed or other_normals.shape[1]:
             moves = ties.moves if prescribed else free
-            told = stick_slip.tangents(np.concatenate([normals, other_normals], axis=1), moves)
-        return cls(ties, way or ties, away, every, told, other_normals, prescribed, cornered)
+            free_tangents = stick_slip.tangents(np.concatenate([normals, other_normals], axis=1), moves)
+        return cls(ties, way or ties, away, every, free_tangents, other_normals, prescribed, cornered)
 
     def along(self, way: Array) -> Array:
         """Tangential parts of relative motions ``(n, gdim)``; prescribed components contribute only their own motion."""
         if not self.prescribed:
             return stick_slip.along(self.tangents, way)
-        told = stick_slip.along(self.free_tangents, way) + stick_slip.along(self.tangents, np.where(self.ties.moves, 0.0, way))
-        return np.where(np.abs(self.other_normals).sum(axis=(1, 2))[:, None] > 0, stick_slip.along(self.tangents, way), told)
+        moving = stick_slip.along(self.free_tangents, way) + stick_slip.along(self.tangents, np.where(self.ties.moves, 0.0, way))
+        return np.where(np.abs(self.other_normals).sum(axis=(1, 2))[:, None] > 0, stick_slip.along(self.tangents, way), moving)
 
     @cached_property
     def slip(self) -> Array:
@@ -81,12 +81,12 @@ class Frame:
         if not (self.prescribed or self.other_normals.shape[1]):
             return np.zeros(len(away))
         along = stick_slip.along(self.tangents, away) - stick_slip.along(self.free_tangents, away)
-        told = np.where(self.other_normals.any(axis=(1, 2)), np.linalg.norm(along, axis=1), 0.0)
+        length = np.where(self.other_normals.any(axis=(1, 2)), np.linalg.norm(along, axis=1), 0.0)
         if not self.prescribed:
-            return told
+            return length
         lost = np.where(left_out[:, :, None], self.free_tangents, 0.0)
         parts = (self.tangents, np.where(self.ties.moves, 0.0, away)), (lost, away)
-        return told + sum(np.linalg.norm(stick_slip.along(T, way), axis=1) for T, way in parts)
+        return length + sum(np.linalg.norm(stick_slip.along(T, way), axis=1) for T, way in parts)
 
 
 def force_times_way(

@@ -62,9 +62,9 @@ class Body(MeshTarget):
             out |= own[nodes] & (self.of_facets(facet, facets.astype(np.int64)) > 0)
         return out
 
-    def allowed(self, told: Array, facet: Ints) -> Bools:
+    def allowed(self, visibility: Array, facet: Ints) -> Bools:
         """See ``MeshTarget``; keys are the last accepted midpoints of contactor facets, and their sets ``(k, gdim + s)``."""
-        where, sets = np.split(told, [self.skin.config.gdim], axis=1)
+        where, sets = np.split(visibility, [self.skin.config.gdim], axis=1)
         # facets on the same side of a body may be below each other's planes; facets of the other side are behind the cells
         may = heights(where, facet, self._planes) >= -np.maximum(self.facets.depth, self._overlap)[facet]
         for k, (_, _, facets) in enumerate(self._apart):
@@ -91,7 +91,7 @@ class AmongBodiesMortar(Mortar):
         out &= ~found.rows.covered
         return replace(found, out=out if found.out is None else out | found.out)
 
-    def told(self, facets: Ints) -> Array:
+    def visibility_keys(self, facets: Ints) -> Array:
         """Visibility keys of contactor facets, see ``Body.allowed`` ``(m, k)``."""
         return np.column_stack([self._middles[facets], self._sets[facets]])
 

@@ -163,14 +163,14 @@ class AmongContact(BodiesContact):
 
     def _received(self) -> Array:
         """Forces ``(n, gdim)`` by nodes of the touched body that follow active contactors, where one is at a sharp edge (collective)."""
-        skin, config, told = self._skin, self.config, []
+        skin, config, parts = self._skin, self.config, []
         for pair in (one.pair for one in self._together if one.pair.asked):
             row, node, weight = pair.kinematics.means()[1]
             own = np.flatnonzero(pair.trial.active[row])
             row, i = row[own], pair.nodes[row[own]]
             forces = -weight[own, None] * pair.trial.force[row]
-            told.append(np.column_stack([node[own], skin.body_of_node[i], skin.corners[i], forces]))
-        both = np.concatenate(told)
+            parts.append(np.column_stack([node[own], skin.body_of_node[i], skin.corners[i], forces]))
+        both = np.concatenate(parts)
         there, arrived = config.send_to_owners(both[:, 0].astype(np.int64), both[:, 1:])
         active = np.flatnonzero(self.pair.trial.active)
         place = np.full(config.n_owned, -1)

@@ -33,7 +33,7 @@ from uem_dolfinx.geometry.projection import FacetProjection, Projection, Target
 from uem_dolfinx.geometry.rigid import Motion
 from uem_dolfinx.geometry.search import MeshTarget
 from uem_dolfinx.geometry.shapes import tangents
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import reduced
 
 #: Facets are parallel if their normals differ by less: rows and gradients of the gaps are then the same.
@@ -130,7 +130,7 @@ class Mortar(Contactors):
 
     # -- rows ------------------------------------------------------------------------------------------------------------
 
-    @timed("segments")
+    @timed_as("segments")
     def _unite(self, nearest: Projection, points: Array, before: Bools) -> WeightedRows:
         """Equations of all contactors; ``before (m, nn)`` are shares of facets that the target covered before (collective)."""
         surface, config, nn = self.surface, self.config, self.surface.dofs.shape[1]
@@ -189,7 +189,7 @@ class Mortar(Contactors):
         part, full = map(self.elimination.seam.sums, areas)
         return part, part / np.where(full > 0, full, 1.0)
 
-    def told(self, facets: Ints) -> Array | None:
+    def visibility_keys(self, facets: Ints) -> Array | None:
         """Visibility keys of contactor facets ``(m,)``: ``(m, k)``; None if they may touch all target facets."""
         return None
 
@@ -238,7 +238,7 @@ class Mortar(Contactors):
         assert isinstance(self.target, MeshTarget)
         shape = self.target.shape
         keys = self.surface.keys[facets]
-        found = find_opposite(self.target, planes, x, reach, (keys, self.faced), self.told(facets))
+        found = find_opposite(self.target, planes, x, reach, (keys, self.faced), self.visibility_keys(facets))
         e = found.facet
         s = overlap(planes, (self.surface.shape, x), (shape, found.x), self.surface.sign[facets], e)
         # facets farther away than the reach have no contact

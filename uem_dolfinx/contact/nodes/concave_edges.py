@@ -271,10 +271,10 @@ class ConcaveEdges:
         known = (state.facet == number) | (state.held == number[:, None]).any(axis=1) | (state.facet < 0)
         free = state.active & ~left & (state.changes < MOST_CHANGES)
         moved = ~known & free
-        slippery = self._of.setting.cones is None
-        i, tied = np.flatnonzero(moved), self._at_bends(nearest, known & free & ~state.in_corner & slippery)
+        slippery, cornered = self._of.setting.cones is None, state.in_corner
+        i, tied = np.flatnonzero(moved), self._at_bends(nearest, known & free & ~cornered & slippery)
         facet, held, changes = state.facet.copy(), state.held.copy(), state.changes.copy()
-        settled = ~moved & ~left & ~state.in_corner
+        settled = ~moved & ~left & ~cornered
         facet[settled] = number[settled]
         taken = np.zeros(len(i), dtype=bool)
         entered = False
@@ -303,7 +303,7 @@ class ConcaveEdges:
         # a contactor that still moves past the end of its corner gets averaged normals
         past = ~known & state.active & (state.changes >= MOST_CHANGES) & (held >= 0).any(axis=1)
         facet[past], held[past] = number[past], -1
-        left_for_good = bool(past.any() or state.in_corner[switch].any())
+        left_for_good = bool(past.any() or cornered[switch].any())
         return replace(state, facet=facet, held=held, changes=changes), entered or left_for_good
 
     def _at_bends(self, nearest: FacetProjection, which: Bools) -> Ints:

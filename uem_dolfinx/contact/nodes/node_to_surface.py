@@ -93,8 +93,8 @@ class NodeToSurface(OnTarget):
         corners = None
         if self.sliding == "finite":
             nearest = projection = self._stuck(self._continued_at_end(self.on_target(points), state), points, state)
-            if self.concave_edges is not None:
-                projection, corners = self.concave_edges.place(nearest, points, state)
+            if (edges := self.concave_edges) is not None:
+                projection, corners = edges.place(nearest, points, state)
         else:
             if self.anchor is None:
                 nearest = projection = self.take_feet(points)

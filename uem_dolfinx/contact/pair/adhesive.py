@@ -1,4 +1,4 @@
-"""The interface of a contact with adhesion: hard contact, and an attraction by the present gaps beside it.
+"""The interface of a contact with adhesion: hard contact, and an attraction by the present gaps.
 
 With the gap g_i, its gradient r_i and the area A_i, the residual is ``F + sum_i A_i r_i a(g_i)``. Its derivative has the terms
 ``sum_i A_i a'(g_i) r_i r_i'``, which soften, and the curvature ``sum_i A_i a(g_i) grad^2 g_i``. The multipliers of contact are

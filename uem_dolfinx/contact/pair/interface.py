@@ -20,7 +20,7 @@ from uem_dolfinx.contact.seam.state import FrictionState, PairState
 from uem_dolfinx.errors import NotFiniteError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.projection import Target
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import agree, reduced
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Interface:
 
     # -- placement of contactors -----------------------------------------------------------------------------------------
 
-    @timed("projection")
+    @timed_as("projection")
     def project(self) -> None:
         """Project the contactors onto the target in the current configuration (collective).
 

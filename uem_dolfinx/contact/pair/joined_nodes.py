@@ -173,7 +173,8 @@ class JoinedInterface(Interface):
     def with_state_of(self, k: int, state: PairState, part: PairState) -> PairState:
         """The state with a contact's part."""
         numbers, surface = self.discretisation.numbers, self.discretisation.surface_of[k]
-        return _with_rows(state, self.discretisation.rows_of[k], _renumbered(part, lambda facet: numbers.here(facet, surface)))
+        renumbered = _each(lambda name, a: numbers.here(a, surface) if name in FACETS else a, part)
+        return _with_rows(state, self.discretisation.rows_of[k], renumbered)
 
     def commit(self) -> None:
         """Make the trial state the committed one, except for skipped contacts; call ``project`` afterwards."""
@@ -181,7 +182,7 @@ class JoinedInterface(Interface):
         skipped = (s.far | ~s.on)[s.label]
         super().commit()
         if skipped.any():
-            self.trial = self.committed = _with_rows(self.committed, skipped, _rows(before, skipped))
+            self.trial = self.committed = _with_rows(self.committed, skipped, _each(lambda _, a: a[skipped], before))
 
 
 def _each(change: Callable[..., Any], *states: PairState) -> PairState:
@@ -200,11 +201,6 @@ def _each(change: Callable[..., Any], *states: PairState) -> PairState:
     return PairState(**found)
 
 
-def _rows(state: PairState, which: Any) -> PairState:
-    """The state of some contactors, by a slice or numbers ``(k,)``."""
-    return _each(lambda _, a: a[which], state)
-
-
 def _with_rows(state: PairState, which: Any, other: PairState) -> PairState:
     """The state with some contactors, by a slice, numbers or a mask, replaced by another state of these."""
 
@@ -214,11 +210,6 @@ def _with_rows(state: PairState, which: Any, other: PairState) -> PairState:
         return a
 
     return _each(changed, state, other)
-
-
-def _renumbered(state: PairState, number: Callable[[Any], Any]) -> PairState:
-    """The state with facets renumbered by ``number (...)``."""
-    return _each(lambda name, a: number(a) if name in FACETS else a, state)
 
 
 class Member(Interface):

@@ -121,7 +121,7 @@ class ContactRows:
         """Rows that restrain rigid-body motions; those of P come last."""
         return self.P if self.crosswise is None else UnitingEquations.join([self.crosswise, self.P], self.P.direction.shape[1])
 
-    @property
+    @cached_property
     def normal(self) -> Bools:
         """Rows along contact normals ``(m,)``."""
         return (self.kind == NORMAL) & (self.tangent < 0)

@@ -107,7 +107,7 @@ def warn_past_seams(contacts: Sequence[Any]) -> None:
         if count:
             logger.warning(
                 "%s: the target ends at the seam of a periodic body, and %d contactors start past this end: contact is missing there, "
-                "and pressures beside it are too large; cut both bodies at the same place",
+                "and pressures next to it are too large; cut both bodies at the same place",
                 contact.name, count,
             )  # fmt: skip
 

@@ -27,7 +27,7 @@ from uem_dolfinx.geometry.search import MeshTarget, nearest_of
 from uem_dolfinx.geometry.sharp import CORNER, sharp_nodes
 from uem_dolfinx.geometry.surfaces import followed_nodes
 from uem_dolfinx.geometry.tags import Tag
-from uem_dolfinx.log import timed
+from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import reduced
 
 #: Corners that penetrate a facet by less than this part of its size lie on the facet, as Newton's method is no more accurate.
@@ -126,7 +126,7 @@ class TargetCorners:
 
         return JoinedTarget(JoinedFacets(self._config, surfaces), False, of_contact), of_contact
 
-    @timed("corners of the target")
+    @timed_as("corners of the target")
     def find(self, stiffness: Array, checked: Bools) -> dict[int, CornerInside]:
         """Penetrating corners in the current configuration, by number of the contact, for contacts in which they matter (collective).
 

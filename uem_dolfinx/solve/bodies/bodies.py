@@ -86,6 +86,7 @@ class Bodies:
         self.config, self.comm, self.u, self.F = config, config.comm, config.whole, F
         self.unknowns = config.unknowns
         self.materials, self.dynamics = list(materials), dynamics
+        self._added: list[Any] = [] if dynamics is None else dynamics.added  # masses at points
         self.tangent = Tangent(F, config, self.materials, dynamics, points, J)
         check = not self.tangent.linear if check_inversion is None else check_inversion
         self.inversions = Inversions(config) if check and config.moves else None
@@ -121,7 +122,7 @@ class Bodies:
             self._fields = FieldScales(self.unknowns, self.tangent)
 
     def link(self, eq: Any) -> None:
-        """Take bodies that ``UnitingEquations`` of users connect as one, where forces are told from rounding (collective)."""
+        """Take bodies that ``UnitingEquations`` of users connect as one, where forces are compared with rounding (collective)."""
         self._linked = linked_bodies(self.config, eq.node[eq.row], eq.followed)
 
     def begin_step(self) -> None:
@@ -171,16 +172,13 @@ class Bodies:
     def forces_at_work(self, F: PETSc.Vec) -> Any:
         """Reference for the size of residuals: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
         norm = F.norm() if self._fields is None else np.maximum(self.unknowns.norms(F), self._fields.terms())
-        return self._beside(norm, [one.size() for one in self._added])
+        return self._with_masses(norm)
 
-    @property
-    def _added(self) -> list[Any]:
-        """Masses at points."""
-        return [] if self.dynamics is None else self.dynamics.added
-
-    def _beside(self, norm: Any, more: Sequence[float]) -> Any:
-        """A norm of forces, or one for each field ``(n_fields,)``, combined with other norms of the displacement's forces."""
-        return np.hypot(norm, self.of_fields(float(np.linalg.norm(more)))) if more else norm
+    def _with_masses(self, norm: Any) -> Any:
+        """A norm of forces, or one for each field ``(n_fields,)``, combined with those of masses at points."""
+        if not self._added:
+            return norm
+        return np.hypot(norm, self.of_fields(float(np.linalg.norm([one.size() for one in self._added]))))
 
     @property
     def linear(self) -> bool:
@@ -251,19 +249,19 @@ class Bodies:
         self.comm.Allreduce(MPI.IN_PLACE, rounded, op=MPI.MAX)
         own = rounded[body[:n], None] if count > 1 else rounded
         limit = ABOVE_ROUNDING * FORCE_ROUNDING * (own + (self.config.size if positioned else 0.0)) * np.abs(self.stiffness)
-        told = float(self.config.vector(np.where(np.abs(F) > limit, F, 0.0)).norm())
+        above = float(self.config.vector(np.where(np.abs(F) > limit, F, 0.0)).norm())
         if self._fields is None:
-            return self._beside(told, [one.size() for one in self._added])
-        return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self.of_fields(told)
+            return self._with_masses(above)
+        return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self.of_fields(above)
 
     def remembered(self, positioned: bool) -> Any:
         """Norm relative to which forces of later steps may be rounding, with the terms of other fields (collective)."""
-        told = self.above_rounding(positioned)
+        above = self.above_rounding(positioned)
         if self._fields is None:
             # laws of the deformation gradient round 1 + grad(u), however small u is; by how much is unknown before the first tangent
-            return told if self.linear or told > self.strain_rounding() > 0.0 else 0.0
+            return above if self.linear or above > self.strain_rounding() > 0.0 else 0.0
         terms, rounding = self._fields.terms(), np.maximum(FORCE_ROUNDING * self._fields.largest(), self.strain_rounding())
-        return np.maximum(told, np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
+        return np.maximum(above, np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
 
     def strain_rounding(self) -> Any:
         """Norm of the forces due to rounding of ``1 + grad(u)``, or one for each field ``(n_fields,)`` (collective)."""

@@ -139,9 +139,9 @@ class FarApart:
             places = x[self._nodes]
             corners[self._here, :g] = -np.minimum.reduceat(places, self._begin)
             corners[self._here, g:] = np.maximum.reduceat(places, self._begin)
-        told = np.concatenate([corners.ravel(), np.zeros(0) if more is None else more.ravel()])
-        self._config.comm.Allreduce(MPI.IN_PLACE, told, op=MPI.MAX)
-        corners, most = told[: corners.size].reshape(-1, 2 * g), told[corners.size :].reshape(-1, n)
+        extremes = np.concatenate([corners.ravel(), np.zeros(0) if more is None else more.ravel()])
+        self._config.comm.Allreduce(MPI.IN_PLACE, extremes, op=MPI.MAX)
+        corners, most = extremes[: corners.size].reshape(-1, 2 * g), extremes[corners.size :].reshape(-1, n)
         low, high = -corners[:, :g], corners[:, g:]
         m = self._n_surfaces - n
         out = self._out[:, None] * (high[n:] - low[n:])

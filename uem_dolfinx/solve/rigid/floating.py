@@ -137,13 +137,13 @@ class FloatingBodies:
             self._refuse_thrown()
         if self.motions.share <= LOADED:
             return
-        told = (
+        message = (
             f"a body that only contact holds is driven sideways by {self.motions.share:.1g} of the forces, and is held at its position: "
             "its contact does not determine its equilibrium"
         )
         if self._bodies.dynamics is None:
-            raise FloatingBodyError(f"{told}; hold it by a Dirichlet condition, or let it come to rest with a decaying drag")
-        logger.warning(told)
+            raise FloatingBodyError(f"{message}; hold it by a Dirichlet condition, or let it come to rest with a decaying drag")
+        logger.warning(message)
 
     def _refuse_thrown(self) -> None:
         """ThrownBodyError for a step in which contacts have pushed a body so far that they no longer hold it (collective)."""

@@ -73,9 +73,9 @@ def least_motion(comm: MPI.Comm, f: Array, B: Any, R: Any, g: Array, likely: Boo
         worst = broken[np.unique(alike[broken], return_index=True)[1]]
         if likely is not None:
             worst, likely = np.union1d(worst, np.flatnonzero(likely & ~idle)), None
-        told = np.column_stack([np.full(len(worst), comm.rank), worst, been[worst]]).astype(np.int64)
+        places = np.column_stack([np.full(len(worst), comm.rank), worst, been[worst]]).astype(np.int64)
         been[worst] = True
-        new = comm.allgather((G[worst], g[worst], told))
+        new = comm.allgather((G[worst], g[worst], places))
         if not sum(len(h) for _, h, _ in new):
             push = np.zeros(len(g))
             push[own] = lam[whose[:, 0] == comm.rank]

@@ -90,7 +90,7 @@ def no_precision(norm: float, rounding: float, real: float) -> PrecisionError:
     """The error for a residual of this norm with this rounding, relative to forces of the norm ``real``."""
     return PrecisionError(
         f"rounding hides the equilibrium: the residual stays at {norm:.3g}, which is {ratio(norm, real):.1g} of the forces at work, "
-        f"while rounding of the stiffest parts alone makes {rounding:.3g}: their stiffness times displacement is too large beside the "
+        f"while rounding of the stiffest parts alone makes {rounding:.3g}: their stiffness times displacement is too large for the "
         "forces; model them as rigid, give them less stiffness or less far to go, or raise rtol if that is accurate enough; bodies that "
         "lie loose, with nothing to press them together yet, need a weight or a load"
     )

@@ -138,9 +138,9 @@ def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
     for i, step in enumerate(steps):
         words = f"the loads of step {i + 1}" + (f", '{step.name}'" if step.name else "")
         refuse_idle(problem, step.loads, bcs, words, [replace(one, loads=None) for one in steps])
-    told = [[step.name, step.n, step.ramp, -1 if step.bcs is None else len(step.bcs)] for step in steps]
+    declared = [[step.name, step.n, step.ramp, -1 if step.bcs is None else len(step.bcs)] for step in steps]
     switched = [[f"{contact.name}: {on}" for contact, on in step.contacts.items()] for step in steps]
-    given.alike(problem.comm, "load_steps", steps=told, contacts=switched)
+    given.alike(problem.comm, "load_steps", steps=declared, contacts=switched)
 
 
 def _check(problem: UnitedProblem, step: Step, words: str) -> None:

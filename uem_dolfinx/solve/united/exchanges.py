@@ -98,7 +98,7 @@ class Exchanges:
     @property
     def softens(self) -> bool:
         """Whether contacts soften, and bodies need not follow an unstable path: without softening their energy falls in any case."""
-        return self.may_jump and any(pair.trial.cohesion is not None for pair in self._pairs)
+        return self.may_jump and any([pair.trial.cohesion is not None for pair in self._pairs])
 
     @property
     def jumps(self) -> bool:
@@ -127,7 +127,7 @@ class Exchanges:
         self._before: list[PairState] | None = None
         self._stays = False
         #: Contactors that have changed state in this problem, and by the present rule.
-        self._changed, self._lately = self._none(), self._none()
+        self._changed = self._lately = self._none()
 
     def take_long(self, violated: Sequence[Violations], cheap: bool, gives_way: bool = False) -> bool:
         """Whether the problem is now to be solved on arrays, which counts as an exchange (collective).
@@ -142,8 +142,8 @@ class Exchanges:
         cheap = cheap and not (gives_way and self.frictional)
         if self._on_arrays or self.frozen or self._number < (AS_LONG_IF_CHEAP if cheap else 0) or not self._pairs:
             return False
-        new = sum(int((w.enter & ~pair.trial.reserved).sum()) for w, pair in zip(violated, self._pairs))
-        number, new = reduced(self._pairs[0].config.comm, np.array([sum(w.count for w in violated), new]))
+        found = [(w.count, int((w.enter & ~pair.trial.reserved).sum())) for w, pair in zip(violated, self._pairs)]
+        number, new = reduced(self._pairs[0].config.comm, np.sum(found, axis=0))
         if not number or new:
             return False
         self._number, self._pivoting, self._on_arrays = self._number + 1, Pivoting(), True
@@ -179,8 +179,8 @@ class Exchanges:
             return [w.among(np.zeros_like(w.enter)) for w in violated]
         both = zip(violated, self._pairs)
         own = np.sum([(w.count, w.enter.sum(), pair.trial.active.sum(), len(pair.nodes)) for w, pair in both], axis=0)
-        told = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
-        (number, entering, active, every), state = told[:, :4].sum(axis=0), tuple(told[:, 4])
+        sums = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
+        (number, entering, active, every), state = sums[:, :4].sum(axis=0), tuple(sums[:, 4])
         self._before = None if entering else [pair.trial for pair in self._pairs]
         if not number:
             return None
@@ -275,7 +275,7 @@ class Exchanges:
 
     def _pattern(self) -> int:
         """Fingerprint of the present states of this rank's contactors."""
-        return zlib.crc32(b"".join(_pattern(pair.trial).tobytes() for pair in self._pairs))
+        return zlib.crc32(b"".join([_pattern(pair.trial).tobytes() for pair in self._pairs]))
 
     def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
         """The error for a cycle, with the names of contactors, marked in masks ``(n,)`` of every pair."""
@@ -312,4 +312,4 @@ def _calm(pair: Interface, which: Bools) -> bool:
 
 def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:
     """Number of violating contactors over all pairs and ranks (collective)."""
-    return int(reduced(pairs[0].config.comm, sum(w.count for w in violated))) if pairs else 0
+    return int(reduced(pairs[0].config.comm, sum([w.count for w in violated]))) if pairs else 0

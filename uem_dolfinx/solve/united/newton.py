@@ -5,8 +5,7 @@ The loop uses the bodies and a ``ContactMethod`` only, so that it serves statics
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -175,54 +174,46 @@ def solve_united(
     if not bodies.assemble():
         remedy = "check loads, material parameters and the initial displacement for NaN and division by zero"
         raise not_finite(bodies, "at the start of the step", remedy)
-    for k in range(max_iterations + 1):
-        with _with_history(history):
+    try:
+        for k in range(max_iterations + 1):
             state = method.assemble_constraints(equilibrium.holds)
             steady = state.right and not state.changed
             if k > 0 and steady and method.return_to_targets(rtol * first(equilibrium.forces(state.scale))):
                 bodies.assemble()
                 state = method.assemble_constraints(equilibrium.holds)
-        verdict = equilibrium.judge(state)
-        if verdict.ends or k == max_iterations:
-            history.append(Iteration(ratio(state.norm, verdict.forces), state.gap, state.active, state.changed, 0, length))
-            _report(history, verbose)
-            if verdict.converged:
-                return history
-            if verdict.hidden:
-                raise no_precision(*worst(state.norm, verdict.rounding, verdict.real))
-            if verdict.flown.any():
-                error = unheld(bodies, int(verdict.flown.argmax()), history[-1].residual)
-                # a shorter step may keep bodies in contact
-                raise ConvergenceError(str(error), history) if state.in_contact and bodies.config.moves else error
-            break
-        # the residual at the beginning of a step does not include prescribed increments and gaps
-        relative = ratio(state.norm, verdict.forces) if k > 0 else 1.0
-        with _with_history(history):
+            verdict = equilibrium.judge(state)
+            if verdict.ends or k == max_iterations:
+                history.append(Iteration(ratio(state.norm, verdict.forces), state.gap, state.active, state.changed, 0, length))
+                _report(history, verbose)
+                if verdict.converged:
+                    return history
+                if verdict.hidden:
+                    raise no_precision(*worst(state.norm, verdict.rounding, verdict.real))
+                if verdict.flown.any():
+                    error = unheld(bodies, int(verdict.flown.argmax()), history[-1].residual)
+                    # a shorter step may keep bodies in contact
+                    raise ConvergenceError(str(error), history) if state.in_contact and bodies.config.moves else error
+                break
+            # the residual at the beginning of a step does not include prescribed increments and gaps
+            relative = ratio(state.norm, verdict.forces) if k > 0 else 1.0
             wanted = rtol * first(verdict.forces)
             problem, step, solves, exchanges = _solve_linearised(method, state, k, wanted, relative, check_signals)
-        driving = np.maximum(norms(problem.rhs), norms(step.rhs))
-        equilibrium.drive(driving)
-        residual = ratio(driving, np.maximum(verdict.forces, driving if k == 0 else 0.0))
-        changed = state.changed or exchanges > 0
-        history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
-        _report(history, verbose)
-        length = _advance(bodies, method, problem, step, line_search)
+            driving = np.maximum(norms(problem.rhs), norms(step.rhs))
+            equilibrium.drive(driving)
+            residual = ratio(driving, np.maximum(verdict.forces, driving if k == 0 else 0.0))
+            changed = state.changed or exchanges > 0
+            history.append(Iteration(residual, state.gap, problem.state.active, changed, solves, length, exchanges))
+            _report(history, verbose)
+            length = _advance(bodies, method, problem, step, line_search)
+    except ConvergenceError as error:
+        error.history = list(history)
+        raise
     last = history[-1]
     raise ConvergenceError(
         f"no convergence in {k} iterations: relative residual {last.residual:.3g} (wanted {rtol:.3g}), gap {last.gap:.3g}, "
         f"{last.active} active contactors{', still changing' if last.changed else ''}; take smaller load steps, or raise max_iterations",
         history,
     )
-
-
-@contextmanager
-def _with_history(history: list[Iteration]) -> Iterator[None]:
-    """Attach the history to convergence errors."""
-    try:
-        yield
-    except ConvergenceError as error:
-        error.history = list(history)
-        raise
 
 
 def _solve_linearised(

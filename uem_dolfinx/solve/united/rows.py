@@ -124,8 +124,8 @@ class OverConstraints:
             masks: equations with forces that cannot be negative, and those that have been left out before ``(m,)``, or none.
         """
         given, rigid = self.parted(equations)
-        firm, g = np.arange(len(given)) >= len(given) - self._n_linear, prescribed.shape[1]
-        masks = tuple(mask[: len(given)] for mask in masks)
+        m, g = len(given), prescribed.shape[1]
+        firm, masks = np.arange(m) >= m - self._n_linear, tuple([mask[:m] for mask in masks])
         left = free if self._rigid is None else self._rigid.left(free)
         independent = self._independent(given, left, None, firm, *masks) if self.contestable else None
         own = given if independent is None else independent.equations
@@ -284,7 +284,7 @@ def _restricted(
         part = slice(start, start + len(own))
         masks[0, part] = own.normal & (not pair.trial.has_law)
         masks[1, part] = own.normal & pair.trial.redundant[own.contactor]
-        start += len(own)
+        start = part.stop
     Q, independent = over_constraints.restrict(whole.rows, free, prescribed, *masks)
     rotated = Q
     if whole.tilt is not None:

@@ -105,7 +105,7 @@ class BodySystem:
         """Collect the pairs that may be in contact on any rank; iterations loop over these only."""
         self.near: list[Interface] = in_question(self.pairs)
         self._heats: list[Heat] = [heat for pair in self.near for heat in pair.heats]
-        self._soft = any(pair.trial.has_law for pair in self.near)
+        self._soft = any([pair.trial.has_law for pair in self.near])
 
     # -- projection of contactors ----------------------------------------------------------------------------------------
 
@@ -116,7 +116,7 @@ class BodySystem:
         self._here = None
         if not self.pairs:
             return
-        self.bodies.check_displacement(min(pair.target.stride for pair in self.pairs))
+        self.bodies.check_displacement(min([pair.target.stride for pair in self.pairs]))
         with timed("search and projection"):
             self.far_apart.place()
             for pair in self.pairs:
@@ -161,10 +161,10 @@ class BodySystem:
 
     def residual(self) -> PETSc.Vec:
         """Forces of the bodies minus loads of contacts and friction that is independent of the normal force (collective)."""
-        F = self.bodies.residual
-        for nodes, forces in filter(None, [*known_forces(self.near), *[pair.applied_forces() for pair in self.near]]):
+        F, known = self.bodies.residual, known_forces(self.near) if self.exchanges.frictional else []
+        for nodes, forces in filter(None, [*known, *[pair.applied_forces() for pair in self.near]]):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
-        F.array[:] += sum(heat.residual() for heat in self._heats)
+        F.array[:] += sum([heat.residual() for heat in self._heats])
         return F
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
@@ -265,7 +265,7 @@ class BodySystem:
         if apart is not None:
             trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
         gaps = [one.largest_gap_here() for one in (*self.near, self.linear) if one is not None]
-        united = sum(int(pair.united.sum()) for pair in self.near)
+        united = sum([int(pair.united.sum()) for pair in self.near])
         each = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
         return trial, *slip_terms(self.near, self.unknowns.vector(), self.linear, convex), int(each[:, 0].sum()), each[:, 1].max()
 
@@ -288,7 +288,7 @@ class BodySystem:
             moved = increment if sliding is None else increment + sliding
             gaps = [pair.kinematics.gap_rows.gaps(increment) if pair.asked else pair.kinematics.gap for pair in self.pairs]
             violated = [Violations.none(len(pair.nodes)) for pair in self.pairs]
-            for k, pair in ((k, pair) for k, pair in enumerate(self.pairs) if pair.asked):
+            for k, pair in [(k, pair) for k, pair in enumerate(self.pairs) if pair.asked]:
                 along = self._across(pair)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated[k] = pair.violated(gaps[k], forces[k], least, near, self._swept, moved)
@@ -347,17 +347,17 @@ class BodySystem:
 
     def _take(self, forces: list[Traction]) -> None:
         """Store the contact forces in the pairs."""
-        for pair, own in ((pair, own) for pair, own in zip(self.pairs, forces) if pair.asked):
+        for pair, own in [(pair, own) for pair, own in zip(self.pairs, forces) if pair.asked]:
             pair.set_forces(own)
         if self.linear is not None:
             self.linear.multipliers = self._multipliers
 
     def rounding(self) -> float:
         """Norm of the forces due to rounding of the displacement, and of the active contactors' positions (collective)."""
-        active = [np.zeros(0, np.int32), *(pair.nodes[pair.united] for pair in self.near)]
+        active = [np.zeros(0, np.int32), *[pair.nodes[pair.united] for pair in self.near]]
         of_bodies = self.bodies.rounding(np.concatenate(active))
         of_heat = sum(self.unknowns.norms_of(heat.sizes()) for heat in self._heats)
-        return of_bodies + FORCE_ROUNDING * (of_heat + self.bodies.of_fields(sum(pair.displaced() for pair in self.near)))
+        return of_bodies + FORCE_ROUNDING * (of_heat + self.bodies.of_fields(sum([pair.displaced() for pair in self.near])))
 
     def reduced_residual(self, state: IterationState) -> PETSc.Vec:
         """``Q'F`` of the last projection and the last assembled residual, with the active set of ``state``.
