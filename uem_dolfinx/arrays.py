@@ -100,6 +100,11 @@ def _refuse_symbols(values: Any) -> None:
             _refuse_symbols(one)
 
 
+def copied(value: Any) -> Any:
+    """A copy of an array, and other objects as they are."""
+    return value.copy() if type(value) is np.ndarray else value
+
+
 def numbers_only(value: Any) -> Any:
     """An array as ``NumbersOnly``, and other objects as they are."""
     return value.view(NumbersOnly) if type(value) is np.ndarray else value

@@ -93,6 +93,14 @@ def numbers(value: Any) -> Array:
     return np.array(value, dtype=float)
 
 
+def returned(what: str, value: Any, expected: str) -> Array:
+    """What a function returned as an array of numbers; InputTypeError for all else."""
+    try:
+        return numbers(value)
+    except (TypeError, ValueError):
+        raise InputTypeError(sentence(what, value, expected)) from None
+
+
 def function(value: Any) -> TypeGuard[Callable[..., Any]]:
     """Whether a value is a function of users; Python calls expressions of UFL callable, too."""
     return callable(value) and not symbolic(value)

@@ -20,7 +20,7 @@ from mpi4py import MPI  # before dolfinx and petsc4py: in the PyPI wheel it load
 import numpy as np
 
 from uem_dolfinx import arrays
-from uem_dolfinx.arrays import AnyArray, Ints, numbers_only, plain
+from uem_dolfinx.arrays import AnyArray, Ints, copied, numbers_only, plain
 from uem_dolfinx.errors import UEMError, UserFunctionError
 
 T = TypeVar("T")
@@ -103,14 +103,14 @@ def ask(what: str, f: Callable[..., T], *args: Any) -> T:
     Args:
         what: name of the function in messages.
         f: called with ``args``.
-        args: of the function.
+        args: of the function, which gets copies of arrays: what it writes into them changes nothing.
 
     Raises:
         UserFunctionError: with the function's name, its error and line; also for GeneratorExit, which would silently end the steps.
             Errors of the package, SystemExit, KeyboardInterrupt and others that are no Exception are not changed.
     """
     try:
-        return cast(T, plain(f(*map(numbers_only, args))))
+        return cast(T, plain(f(*(numbers_only(copied(one)) for one in args))))
     except UEMError:
         raise
     except (Exception, GeneratorExit) as error:

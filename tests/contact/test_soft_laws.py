@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import M, blocks, highest, linear, lowest, refused, run
 
 import uem_dolfinx as uem
 
@@ -89,3 +89,25 @@ def test_functions_that_are_no_law():
 
 def _raising(gap):
     raise ValueError("no pressure today")
+
+
+FLAT = {
+    "a kink": (lambda g: 20.0 * np.maximum(-g, 0.0), lambda g: np.where(g < 0.0, -20.0, 0.0)),
+    "a parabola": (lambda g: 2e4 * np.maximum(-g, 0.0) ** 2, lambda g: -4e4 * np.maximum(-g, 0.0)),
+    "later": (lambda g: 20.0 * np.maximum(-g - 1e-3, 0.0), None),
+    "later, by its slope": (lambda g: 20.0 * np.maximum(-g - 1e-3, 0.0), lambda g: np.where(g < -1e-3, -20.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+@pytest.mark.parametrize("name", FLAT)
+@pytest.mark.every_case
+def test_a_law_without_a_slope_at_rest(name, coupling):
+    """In the first step, too, pressures are those of the gaps; it once ended with overlapping bodies and without a force."""
+    b = blocks(COMM, "quadrilateral", 2, 2)
+    contact = uem.Contact(b.high, b.low, normal=uem.SoftContact(*FLAT[name]), coupling=coupling)
+    run(uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.01), contacts=[contact]))
+    gap = contact.pair.gaps()
+    for p in (FLAT[name][0](gap), 0.5 * M * (0.01 + gap)):
+        assert highest(COMM, np.abs(contact.pressures - p)) <= 1e-9 * M
+    assert lowest(COMM, contact.pressures) >= 0.2 * 0.01 * M

@@ -119,7 +119,7 @@ def test_imports_point_one_way():
 #: What may not grow: whoever needs more raises the number in a commit that gives the reason, and what went for it.
 BUDGETS = {
     "members of the seam": 26, "members of Interface": 49, "heuristics": 12, "arrows within contact": 70, "arrows within solve": 35,
-    "lines of the package": 59428,
+    "lines of the package": 59446,
 }  # fmt: skip
 
 

@@ -208,3 +208,23 @@ def test_signals_while_a_step_is_taken_again(number, kept, folder):
     assert len(found) == 1 and np.array_equal(found[0], scene.b.u.x.array)
     assert (folder / "run").exists() == kept
     assert scene.problem.progress.interruption is None and not scene.problem.progress.inside
+
+
+@pytest.mark.parametrize("in_stages", [False, True])
+def test_a_loop_within_a_loop(in_stages):
+    """The outer one has no steps left once the inner one is at the full load: it says so, where it once ended without a word."""
+    w, taken = Warm(), []
+
+    def nested():
+        for step in uem.load_steps(w.problem, [uem.Step("a", 2)] if in_stages else 2):
+            taken.append(step.factor)
+            list(uem.load_steps(w.problem, 1))
+
+    raised(uem.InputError, "another loop over load_steps.* at its load factor 0.5: expected one loop after the other", nested)
+    assert taken == [0.5]
+    # a loop that is left, and another one in the body of the last step, are none of these
+    for step in uem.load_steps(w.problem, 4):
+        break
+    for step in uem.load_steps(w.problem, 2):
+        if step.factor == 1.0:
+            list(uem.load_steps(w.problem, 1))

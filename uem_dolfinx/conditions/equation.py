@@ -203,9 +203,9 @@ class Periodic(given.Sealed):
     def _images(self, config: Configuration, x: Array, shift: Array, role: str) -> Array:
         """Positions of the partners of followers at ``x (n, gdim)`` (collective)."""
         if self._map is not None:
-            images = ask_together(config.comm, f"the map of {role}", self._map, np.array(x))
+            images = ask_together(config.comm, f"the map of {role}", self._map, x)
             with agreed(config.comm):
-                images = np.asarray(images, dtype=float)
+                images = given.returned(f"the map of {role}", images, f"finite positions of the shape {x.shape}")
                 if images.shape != x.shape or not np.isfinite(images).all():
                     raise InputError(
                         f"the map of {role} returned an array of shape {images.shape}: expected finite ones of {x.shape}"

@@ -50,7 +50,7 @@ class Rule:
         if isinstance(self.value, Expr):
             self.interpolate()
             return
-        arguments = (self._places.copy(), at) if self.of_load else (self._places.copy(),)
+        arguments = (self._places, at) if self.of_load else (self._places,)
         found = ask_together(comm, f"{self._words} at {at:.6g}", self.value, *arguments)
         with agreed(comm):
             self._write(found)

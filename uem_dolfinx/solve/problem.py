@@ -286,7 +286,7 @@ class UnitedProblem(given.Sealed):
 
         ``known``: whether the committed state has been reached with these loads; otherwise the next step begins with them.
         """
-        self.set_at = None if known else at
+        self.set_at = None if known else given.number("factor or time", at)
         if self.stage is not None:
             self.stage.take_load(at)
         set_loads(self.comm, self.load, at, self.bodies.bcs)

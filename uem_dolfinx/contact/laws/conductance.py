@@ -117,12 +117,14 @@ class Conductance(given.Sealed):
         """
         if not callable(self.h):
             return np.where(closed, self.h, 0.0)
-        h, n = np.array(ask_together(comm, f"contact '{name}': heat, h", self.h, *state), dtype=float), len(closed)
+        values, n = ask_together(comm, f"contact '{name}': heat, h", self.h, *state), len(closed)
+        words = f"contact '{name}': heat, {'h(p, g, T, T_target)' if len(state) == 4 else 'h(p, g)'}"
+        expected = f"{n} numbers, {given.NOT_NEGATIVE.words}"
         with agreed(comm):
+            h = given.returned(words, values, expected)
             if (h.ndim and h.shape != (n,)) or not given.NOT_NEGATIVE.holds(h).all():
-                words = "h(p, g, T, T_target)" if len(state) == 4 else "h(p, g)"
                 found = given.fault(h if h.ndim else np.full(n, h), (n,), given.NOT_NEGATIVE)
-                raise InputError(f"contact '{name}': heat, {words} {found}: expected {n} numbers, {given.NOT_NEGATIVE.words}")
+                raise InputError(f"{words} {found}: expected {expected}")
         return np.broadcast_to(h, (n,))
 
 

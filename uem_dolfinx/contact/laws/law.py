@@ -19,7 +19,7 @@ from dolfinx import fem
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.laws.coulomb import Coulomb
-from uem_dolfinx.errors import InputError, InputTypeError
+from uem_dolfinx.errors import InputError
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.parallel import agreed, ask_together, reduced
 
@@ -318,10 +318,7 @@ def asked_at(
     places[: config.gdim] = config.X[nodes].T
     found = ask_together(config.comm, words, f, places, *more)
     with agreed(config.comm):
-        try:
-            value = given.numbers(found)
-        except (TypeError, ValueError):
-            raise InputTypeError(given.sentence(f"{words}(x)", found, f"{n} numbers")) from None
+        value = given.returned(f"{words}(x)", found, f"{n} numbers")
     if more and value.ndim == 0:
         value = np.full(n, value)
     with agreed(config.comm):

@@ -69,7 +69,7 @@ class _OfFunction:
 
     def pressure(self, gap: Array) -> tuple[Any, Any]:
         """See ``PressureLaw``."""
-        return self.p(gap), None if self.slope is None else self.slope(gap)
+        return self.p(gap.copy()), None if self.slope is None else self.slope(gap)
 
 
 #: A stiffness per area, a law, pairs of gap and pressure, or a function of gaps ``(n,)`` that returns pressures ``(n,)``.
@@ -130,14 +130,12 @@ class SoftContact(given.Sealed):
         words = f"contact '{name}': normal, p"
 
         def checked(what: str, values: Any, sign: float) -> Array:
-            found, within = np.asarray(values, dtype=float), given.Range("", lambda x: given.NOT_NEGATIVE.holds(sign * x))
+            within, called = given.Range("", lambda x: given.NOT_NEGATIVE.holds(sign * x)), f"contact '{name}': normal, {what}(g)"
+            expected = f"{len(gap)} finite numbers, pressures that are not negative and do not increase with the gap"
             with agreed(comm):
+                found = given.returned(called, values, expected)
                 if found.shape != gap.shape or not within.holds(found).all():
-                    fault = given.fault(found, gap.shape, within)
-                    raise InputError(
-                        f"contact '{name}': normal, {what}(g) {fault}: expected {len(gap)} finite numbers, pressures that are not "
-                        "negative and do not increase with the gap"
-                    )
+                    raise InputError(f"{called} {given.fault(found, gap.shape, within)}: expected {expected}")
             return found
 
         p, slope = ask_together(comm, words, self.law.pressure, gap)

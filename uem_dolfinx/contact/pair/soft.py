@@ -131,14 +131,16 @@ class SoftInterface(Interface):
         if not self._acts or known is None:
             self._multipliers, self._stiffness, self._holds = *np.zeros((2, n)), np.zeros(n, dtype=bool)
             return
-        gap = self.gaps()
-        rest = self._at_rest()
-        at = np.where(np.isinf(known), gap, known)
+        gap, rest, touching = self.gaps(), self._at_rest(), TOUCHING * self.config.size
         # where the law has no slope contactors are open; those that just touch have the stiffness of those that press
-        opened = np.where(gap <= rest + TOUCHING * self.config.size, rest, gap)
-        self._at = np.where(self.pressures_at(at)[1] < 0.0, at, opened)
+        begun = np.where(self.pressures_at(rest)[1] < 0.0, rest, rest - touching)
+        self._at = np.where(np.isinf(known), gap, known)
+        # a law that is flat at rest, too, presses by the gaps
+        for other in (np.where(gap <= rest + touching, begun, gap), gap):
+            self._at = np.where(self.pressures_at(self._at)[1] < 0.0, self._at, other)
         p, slope = self.pressures_at(self._at)
-        stiff = float(self._of_law(np.array([self._law.law.rest]))[1][0])
+        at_rest, below = self._of_law(self._law.law.rest - np.array([0.0, touching]))[1]
+        stiff = float(at_rest or below)
         self._area = np.where(self.off | ~self._contact.leads(), 0.0, self._contact.measured_areas())
         self._multipliers, self._stiffness = self._area * p / self._force, -self._area * slope / self._force**2
         self._holds = (self._area > 0.0) & (slope < 0.0) & (slope <= HELD_FROM * stiff)

@@ -138,6 +138,7 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
     progress = problem.progress
     if not progress.begin_ramp(problem.u.x.array, steps):
         return
+    ramp = progress.ramp
     if progress.factor != 0.0:
         problem.set_load(progress.factor)
     unstable: float | None = None  # load factor of the last unstable equilibrium
@@ -165,6 +166,11 @@ def _load_steps(problem: UnitedProblem, steps: int, way: ByLoad | AlongArc) -> I
             unstable = factor
         number, cuts = progress.control.done(iterations, way.longer)
         yield LoadStep(number, factor, iterations, cuts)
+        if progress.ramp != ramp and factor < 1.0:
+            raise InputError(
+                f"another loop over load_steps of the problem has begun within this one, at its load factor {factor:.6g}: expected one "
+                "loop after the other; repeat a step by problem.solve(), and leave a loop by break"
+            )
 
 
 def _by_load(problem: UnitedProblem, tolerance: float | None) -> ByLoad:
