@@ -21,23 +21,26 @@ from uem_dolfinx.geometry.neighbours import Neighbour, Neighbours
 COMM = MPI.COMM_WORLD
 
 
-def closed(cell, angle=0.0, load=4e-3, steps=4, degree=1, more=0.0, normals="facet", **how):
-    """A fork turned by an angle whose prongs are pressed together: its contact, displacements in its own axes, and iterations."""
+def closed(cell, angle=0.0, load=4e-3, steps=4, degree=1, more=0.0, normals="facet", length=1.0, stress=1.0, **how):
+    """A fork turned by an angle whose prongs are pressed together: its contact, displacements in its own axes, and iterations.
+
+    ``length`` and ``stress`` are the units.
+    """
     g = 2 if cell in ("triangle", "quadrilateral") else 3
     R = np.eye(g)
     R[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    s = scene(COMM, cell, [fork(cell, more=more)], pose=lambda x: x @ R.T, **how)
+    s = scene(COMM, cell, [fork(cell, more=more)], pose=lambda x: length * (x @ R.T), **how)
     V = compat.function_space(s.mesh, degree, (g,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     push = fem.Constant(s.mesh, 0.0)
     across = ufl.as_vector([float(c) for c in R[:, 1]])
-    law = uem.NeoHooke(1.0, 0.3, kind="plane_strain" if g == 2 else "3d")
+    law = uem.NeoHooke(stress, 0.3, kind="plane_strain" if g == 2 else "3d")
     F = law.residual(u, v) * ufl.dx
     for side in (1, -1):
         F += side * push * ufl.inner(across, v) * uem.ds(s.tag(f"outer{side}", 0, at(1, 0.45 * side)))
     contact = uem.GeneralContact(self_contact=True, normals=normals)
     bcs = [uem.dirichlet(V, s.tag("root", 0, at(0, -0.4)))]
-    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load={push: load}, rtol=1e-10)
+    problem = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load={push: load * stress}, rtol=1e-10)
     history = run(problem, steps)
     X, U = (a @ R for a in (problem.config.X, problem.config.displacement))
     own = slice(problem.config.n_owned)
@@ -100,6 +103,17 @@ def test_prongs_in_any_pose(cell, more):
         upper = (X[:, 0] > 0.05) & (np.abs(X[:, 1] - 0.05) < 1e-9)
         assert COMM.allreduce(float((X + U)[upper, 1].min(initial=1.0)), op=MPI.MIN) > -0.06
     assert np.ptp(found) < 0.01 * found[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cell", "angle"), [("quadrilateral", 0.0), ("triangle", 0.2)])
+def test_units(cell, angle):
+    """In nanometres and kilometres, soft and stiff, prongs close by the same displacements in the same iterations."""
+    _, _, U, iterations = closed(cell, angle)
+    for length, stress in ((1e3, 1.0), (1e3, 2.1e11), (1e-9, 2.1e11)):
+        _, _, W, scaled = closed(cell, angle, length=length, stress=stress)
+        assert scaled == iterations
+        assert farthest(W / length - U) < 1e-12
 
 
 @pytest.mark.parametrize(
