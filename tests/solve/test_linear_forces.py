@@ -18,11 +18,11 @@ from uem_dolfinx.solve.bodies.linear_forces import resistance_to_translation
 COMM = MPI.COMM_WORLD
 
 
-def flying(foundation=0.0):
+def flying(foundation=0.0, cell="triangle", degree=1):
     """Two irregular bodies in flight, on a foundation of this stiffness by volume."""
-    parts = [box("triangle", [0.0, 3.0 * k], [2.0, 3.0 * k + 1.0], [9, 6]) for k in range(2)]
-    s = scene(COMM, "triangle", parts, pose=lambda x: x + 0.02 * np.sin(7.0 * x[:, ::-1]))
-    V = compat.function_space(s.mesh, 1, (2,))
+    parts = [box(cell, [0.0, 3.0 * k], [2.0, 3.0 * k + 1.0], [9, 6]) for k in range(2)]
+    s = scene(COMM, cell, parts, pose=lambda x: x + 0.02 * np.sin(7.0 * x[:, ::-1]))
+    V = compat.function_space(s.mesh, degree, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = uem.LinearElastic(900.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
     F += fem.Constant(s.mesh, foundation) * ufl.inner(u, v) * ufl.dx
@@ -50,11 +50,13 @@ def test_momentum_of_translated_bodies(foundation):
         assert np.abs(total).max() <= 1e-12 * strained
 
 
-@pytest.mark.parametrize("foundation", [0.0, 1e-9])
-def test_what_resists_a_translation(foundation):
+@pytest.mark.parametrize(
+    "foundation, cell, degree", [(0.0, "triangle", 1), (0.0, "triangle", 2), (0.0, "quadrilateral", 1), (1e-9, "triangle", 1)]
+)
+def test_what_resists_a_translation(foundation, cell, degree):
     """Rounding of K does not resist a translation; the weakest foundation that is told from it does, with its stiffness."""
-    K = flying(foundation).bodies.update_tangent()
-    found = resistance_to_translation(K, flying().config.unknowns)
+    problem = flying(foundation, cell, degree)
+    found = resistance_to_translation(problem.bodies.update_tangent(), problem.config.unknowns)
     total = np.sum(COMM.allgather(found.sum(axis=0)), axis=0)
     if foundation == 0.0:
         assert not found.any()
