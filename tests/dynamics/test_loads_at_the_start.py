@@ -26,7 +26,7 @@ class Bar:
     """A bar ``[0, 1] x [0, 4]`` of density 1, whose lower end is a contactor without mass, and its load there."""
 
     def __init__(
-        self, scheme=None, cell="quadrilateral", degree=1, law=uem.LinearElastic, mass=uem.lumped_mass, beside=lambda bar: {}, wall=-5.0,
+        self, scheme=None, cell="quadrilateral", degree=1, law=uem.LinearElastic, mass=uem.lumped_mass, others=lambda bar: {}, wall=-5.0,
         load=LOAD, fluid=None, held=False, damping=None, n=20,
     ):  # fmt: skip
         g = 2 if cell in ("triangle", "quadrilateral") else 3
@@ -45,7 +45,7 @@ class Bar:
         self.dynamics = uem.Dynamics(mass(V, 1.0), scheme=scheme, damping=form)
         self.problem = uem.UnitedProblem(
             F, self.u, contacts=[self.contact], dynamics=self.dynamics, rtol=1e-12,
-            bcs=[uem.dirichlet(V, self.end, g - 1)] if held else [], **beside(self),
+            bcs=[uem.dirichlet(V, self.end, g - 1)] if held else [], **others(self),
         )  # fmt: skip
 
     def nodal(self, f):
@@ -81,17 +81,17 @@ def test_a_step_load(scheme):
 @pytest.mark.parametrize(
     "how",
     [
-        {"beside": lambda bar: {"equations": [uem.periodic(*bar.sides)]}},
-        {"beside": lambda bar: {"couplings": [uem.RigidCoupling(bar.end, (0.5, 0.0), mass=2.0)]}},
+        {"others": lambda bar: {"equations": [uem.periodic(*bar.sides)]}},
+        {"others": lambda bar: {"couplings": [uem.RigidCoupling(bar.end, (0.5, 0.0), mass=2.0)]}},
         {"load": 0.0, "fluid": LOAD, "wall": 0.0},
         *map(
             slow,
             [
                 {"cell": "triangle", "degree": 2, "mass": uem.consistent_mass, "law": uem.NeoHooke}, {"cell": "hexahedron"},
                 {"cell": "tetrahedron", "law": uem.StVenantKirchhoff}, {"damping": 0.5, "scheme": uem.generalised_alpha(0.5)},
-                {"beside": lambda bar: {"couplings": [uem.RigidCoupling(bar.top, (0.5, LENGTH), mass=2.0)]}},
-                {"beside": lambda bar: {"couplings": [uem.RigidCoupling(bar.end, (0.5, 0.0))]}, "law": uem.NeoHooke},
-                {"load": 0.0, "beside": lambda bar: {"points": [uem.PointLoad((x, 0.0), (0.0, 0.5 * LOAD)) for x in (0.0, 1.0)]}},
+                {"others": lambda bar: {"couplings": [uem.RigidCoupling(bar.top, (0.5, LENGTH), mass=2.0)]}},
+                {"others": lambda bar: {"couplings": [uem.RigidCoupling(bar.end, (0.5, 0.0))]}, "law": uem.NeoHooke},
+                {"load": 0.0, "others": lambda bar: {"points": [uem.PointLoad((x, 0.0), (0.0, 0.5 * LOAD)) for x in (0.0, 1.0)]}},
                 {"load": 0.0, "fluid": LOAD, "wall": 0.0, "law": uem.NeoHooke},
             ],
         ),
@@ -140,7 +140,7 @@ def test_a_body_without_mass():
 
 
 def test_a_support_that_is_removed():
-    """A load that a support of the surface bears acts on the bar from the instant on at which the support goes."""
+    """A load that a support of the surface bears acts on the bar from the instant on at which the support is removed."""
     bar, dt = Bar(held=True), 2e-3
     list(uem.time_steps(bar.problem, dt, 4 * dt))
     assert np.abs(bar.dynamics.momentum()).max() < 1e-14
@@ -161,7 +161,7 @@ def test_resumed(folder):
 def test_what_is_in_equilibrium_stays():
     """A bar that statics has brought to rest under its load stays there to rounding."""
     bar = Bar(
-        beside=lambda bar: {"points": [uem.PointLoad((x, LENGTH), (0.0, -0.5 * LOAD)) for x in (0.0, 1.0)]}, wall=0.0, load=0.0
+        others=lambda bar: {"points": [uem.PointLoad((x, LENGTH), (0.0, -0.5 * LOAD)) for x in (0.0, 1.0)]}, wall=0.0, load=0.0
     )
     bar.problem.solve()
     before = np.array(bar.u.x.array)

@@ -260,8 +260,8 @@ class Sliding:
         T, tau = frame.free_tangents, frame.tangential(_of(state).tau) / kinematics.ties.share[:, None]
         # prescribed components at rest carry no friction; if all are prescribed, only the moving ones do
         partly = (frame.tangents != 0).any(axis=2).sum(axis=1) > (T != 0).any(axis=2).sum(axis=1)
-        goes = self.forced() | stick_slip.continues(_of(state).direction, T, frame.away, GAP_ROUNDING * self.config.size)
-        tau = np.where((partly & (goes == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
+        slides = self.forced() | stick_slip.continues(_of(state).direction, T, frame.away, GAP_ROUNDING * self.config.size)
+        tau = np.where((partly & (slides == ~T.any(axis=(1, 2))))[:, None], stick_slip.along(T, tau), tau)
         q = c[:, None] * frame.slip - tau
         self.pivot = Pivot.begin(c, q, tau)
         return replace(state, friction=stick_slip.turned(_of(state), self.slipping(state), q))
