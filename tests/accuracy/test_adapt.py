@@ -34,6 +34,7 @@ def punch(size=None, degree=2, h=0.5, quads=0, comm=COMM):
     return uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
 
 
+@pytest.mark.slow
 def test_a_sharp_corner():
     """An error of 1 % takes a few hundred cells of degree 2; uniform ones of a quarter of the size have 7 % with 2,400."""
     found = uem.adapt(punch, tolerance=0.01)
@@ -92,6 +93,7 @@ def test_few_facets_in_contact(caplog):
     assert not adapted.estimate.narrow and adapted.estimate.at_most == adapted.estimate.relative
 
 
+@pytest.mark.slow
 def test_a_large_tolerance():
     """The estimate of the first mesh, 17 %, where the force errs by half, does not satisfy a tolerance of 20 %: its contact is narrow."""
     found, fine = (uem.adapt(pressed, tolerance=tolerance) for tolerance in (0.2, 0.01))

@@ -57,6 +57,7 @@ def test_polynomials(dim, quads, degree, order):
     assert np.allclose(after.u.x.array, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
 def test_fewer_iterations(coupling):
     """A seal at large strain: the same force and meshes as by two load steps from zero, by at most half as many iterations."""
@@ -67,6 +68,7 @@ def test_fewer_iterations(coupling):
     assert np.isclose(found[0].estimate.value, found[1].estimate.value, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_guess_that_leads_nowhere():
     """Where solve_again does not converge, solve solves the problem from its beginning."""
 

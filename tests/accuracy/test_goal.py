@@ -280,6 +280,7 @@ def test_parts_of_cells(coupling, finer):
     assert COMM.allreduce(found.shares.sum()) > abs(found.error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [1, slow(2)])
 def test_a_rigid_punch(degree):
     """The same under a rigid target with a sharp corner."""
@@ -308,6 +309,7 @@ def test_meshes_for_a_force(degree):
     assert found.meshes[-1].cells < cells and error < abs(value(goals["force"]) / exact("punch")["force"] - 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
 def test_meshes_for_the_force_on_a_wall(coupling):
     """To 0.1 % at large strain, with estimates of 0.5 to 2 times the error, and fewer unknowns than uniform meshes take."""

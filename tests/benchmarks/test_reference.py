@@ -56,6 +56,7 @@ def test_decks_that_are_not_there(tmp_path):
         compare.main(["tube of CAX8"], tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="it starts a process of its own")
 def test_a_scene_against_its_reference(monkeypatch, capsys):
     scene = json.loads(json.dumps(next(s for s in compare.SCENES if s["name"] == "press fit")))

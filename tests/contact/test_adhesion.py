@@ -29,6 +29,7 @@ def test_the_law():
     assert np.allclose(np.diff(t[1:900]) / 1e-5, slope[1:899]) and law.attraction(np.array([-1e-3]))[0] == [2.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["mortar", slow("node_to_surface")])
 def test_pull_off_of_a_sphere(coupling):
     """A rigid paraboloid pressed into an elastic half-space is pulled off by 1.5 pi w R (JKR), within 4 % on this mesh."""

@@ -68,6 +68,7 @@ def test_a_bond_is_pulled_apart(cell, coupling, degree, law):
     assert highest(COMM, contact.damage.x.array) > 1.0 - 1e-9 and traction < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_work_of_a_separation(coupling, share):
@@ -174,6 +175,7 @@ def test_friction_on_the_damaged_part():
     assert contact.resultant().force[0] == pytest.approx(-mu * contact.resultant().force[1], rel=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", ["shear", "one arm"])
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_split_beam(coupling, load):
@@ -270,6 +272,7 @@ def test_a_run_that_goes_on(folder, unloading, friction):
     refused(uem.CheckpointError, "cohesion", lambda: forces(b, problem, file=True))
 
 
+@pytest.mark.slow
 def test_a_mass_on_a_bond():
     """A stiff mass on an intact bond swings with the period 2 pi sqrt(m / (K A)), and loses no energy; a fast one breaks it."""
     K, m = 400.0, 1.0
@@ -334,6 +337,7 @@ def test_damage_in_result_files(folder):
         )
 
 
+@pytest.mark.slow
 def test_flexure_that_snaps_back():
     """End-notched flexure under dead load: both load and displacement fall while the crack grows at its energy release rate, to 1 %."""
     L, h, E, nu, G, crack = 100.0, 5.0, 70e3, 0.3, 1.0, 50.0
@@ -415,6 +419,7 @@ def test_dissipation_refuses_other_laws():
     refused(uem.InputError, "VonMises", lambda: next(uem.load_steps(problem, 2, arc_length=uem.Dissipation(1.0))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_an_energy_of_several_contactors(coupling):
     """A step that is to separate the whole bond several times over ends in an error that names the energy of a contactor."""

@@ -78,6 +78,7 @@ def integrals(n, steps, pitches=1, **how):
     return work / force, (energies[-1] - energies[0]) / force
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, slow(2)])
 def test_a_drag_without_friction_loses_no_energy(n):
     """What the drag does over a pitch of the slab is stored; without corners jumps lose 4 % of force times way at n = 1."""

@@ -91,6 +91,7 @@ def test_action_and_reaction():
         assert part.balance().force < 1e-12 and part.balance().moment < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.3, slow(0.0)])
 def test_any_pose_and_order(friction):
     """The force turns with the scene, and does not tell whose nodes are contactors."""
@@ -104,6 +105,7 @@ def test_any_pose_and_order(friction):
     assert np.abs(np.array(found) - found[0]).max() < 1e-6 * np.abs(found[0]).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on_edge", [True, False])
 def test_coulomb(on_edge):
     """Where a rod is dragged over the other one it slips, by Coulomb's law in the plane of both edges, and friction dissipates."""
@@ -198,6 +200,7 @@ def flying(end=0.3, **how):
     return r, most, law.momentum() - start, book
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_impact(friction):
     """A rod flies into another one, edge on edge: it pushes it, momentum is kept, and contact adds no energy."""
@@ -212,6 +215,7 @@ def test_impact(friction):
     assert max(row.contact for row in book.rows) < 0.02 * book.rows[0].kinetic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.2, slow(0.0)])
 def test_checkpoints(friction, folder):
     """A run that goes on from a checkpoint ends like one that was left alone, with rods that touch at several crossings."""
@@ -248,6 +252,7 @@ def dragged(steps, first=None):
     return r
 
 
+@pytest.mark.slow
 def test_from_piece_to_piece():
     """A crossing that slides on to the next nodes keeps its friction: force and dissipation know nothing of steps or order."""
     fine, swapped, coarse = dragged(6, first=0), dragged(6, first=1), dragged(4)
@@ -256,6 +261,7 @@ def test_from_piece_to_piece():
     assert fine.edges[0].dissipation == pytest.approx(swapped.edges[0].dissipation, rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.25 * np.pi, slow(0.3), slow(1.0)])
 def test_a_box_on_a_box(angle):
     """Turned: at crossings of edges where no node is near, too; forces on coarse meshes are nearer to those on fine ones."""
@@ -272,6 +278,7 @@ def test_a_box_on_a_box(angle):
     assert abs(forces[1] - forces[0]) < abs(forces[2] - forces[0]) or angle < 0.7
 
 
+@pytest.mark.slow
 def test_gradient():
     """The derivative by one rod's modulus, through a crossing that moves along both edges, is that of differences."""
 

@@ -112,6 +112,7 @@ def test_a_box_on_a_box():
     assert np.ptp(forces) < 0.01 * abs(forces[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.0, slow(0.2)])
 def test_results_are_of_all_parts(friction):
     """Forces on either side, their moments, the sum of normal forces, slip's work, and the force of the supports."""

@@ -87,6 +87,7 @@ def test_a_target_that_ends_over_facets_that_stick(cell, degree):
     assert np.linalg.norm(f[:2]) == pytest.approx(-0.3 * f[2], rel=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [1, slow(2)])
 def test_a_cylinder_slides_far(comm, degree):
     """Pressed and driven past its own contact it finds the same on any number of ranks, and loses what its friction takes."""

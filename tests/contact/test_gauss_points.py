@@ -132,6 +132,7 @@ def test_pressed_on_a_ball(cell):
     assert 0 < own == pytest.approx(mortar, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rigid", [False, True])
 def test_gradients_of_its_pressures(rigid):
     """The seam is enough for derivatives of pressures, by all but the shape, with which weights over areas as drawn change."""

@@ -36,6 +36,7 @@ def test_uniform_strain_on_meshes_that_do_not_match(cell, counts, n, mu):
     assert np.abs(sum(forces)).max() < 1e-13 and max(np.abs(f).max() for f in forces) > 0.9 * M * strain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows,columns,end,mu", [(2, 1, 0.12, 0.2), slow(3, 2, 0.3, 0.0)])
 def test_discs_as_declared_by_hand(rows, columns, end, mu):
     """Every step, iteration and displacement is that of pairs declared by hand."""

@@ -82,6 +82,7 @@ def test_a_ball_on_three(n, seed):
     assert b.contact.n_active >= 4
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_who_is_active():
     """Whoever is active: rows and gaps stay, and what P and c allow closes the gaps of all active contactors to first order."""
     b = Balls(4, 0.2, 0)

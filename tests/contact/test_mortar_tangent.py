@@ -131,6 +131,7 @@ def test_curvature_against_differences(cell, target, offset):
         assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cell,target", [("hexahedron", "end"), *map(slow, ["tetrahedron"] * 2 + ["hexahedron"], ["mesh", "end", "mesh"])]
 )

@@ -136,6 +136,7 @@ def shallow(press, swap):
     return pressed([slab, die], ([(0, at(1, 0.0))], [(1, face)]), led, (1.0, 10.0), **how)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("press, swap, drag, steps", [(0.6, True, 0.4, 4), (1.0, True, 0.4, 4), (1.0, False, 1.0, 10)])
 def test_shallow_ironing(press, swap, drag, steps):
     """Corners that jump from facet to facet, at limit points of the path, and dual functions at the target's end: no step is cut."""

@@ -108,6 +108,7 @@ def in_trough(cell, slope, **how):
     return Guided(cell, low, high, [at(2, 0.0)] * 2, at(2, 0.5), 1e-3, pose=pose, **how)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cell", "how", "corners"),
     [

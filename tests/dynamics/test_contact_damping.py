@@ -54,6 +54,7 @@ def lowest(values):
     return COMM.allreduce(np.min(values, initial=np.inf), op=MPI.MIN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("zeta", "options"),
     [
@@ -83,6 +84,7 @@ def test_restitution(zeta, options):
     assert row.contact + row.friction == pytest.approx(0.0, abs=0.02 * lost)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law", [uem.SoftContact(uem.Exponential(0.5, 0.02), damping=3.0), uem.SoftContact([(-1.0, 400.0), (0.0, 0.0)], damping=20.0)]
 )
@@ -97,6 +99,7 @@ def test_any_law_is_damped(law):
     assert highest(COMM, np.abs(law.law.pressure(gaps)[0] - 5.0)) <= 0.03
 
 
+@pytest.mark.slow
 def test_damped_vibration():
     """In contact throughout, a block swings about its rest with the logarithmic decrement of its dashpot."""
     k, zeta, down = 400.0, 0.05, 4.0
@@ -134,6 +137,7 @@ def test_a_run_goes_on(folder):
     assert more == rows[8:]
 
 
+@pytest.mark.slow
 def test_a_general_contact():
     """Declared by all surfaces a block damps as by a contact of its own."""
     found = []
@@ -144,6 +148,7 @@ def test_a_general_contact():
     assert found[1] == pytest.approx(found[0], abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [{}, slow({"coupling": "mortar"}), slow({"dim": 3}), slow({"zeta": 0.3})], ids=str)
 def test_bodies_that_meet_corner_on_corner(how):
     """In general contact two stiff bodies of unit mass between rollers part as masses on a spring and a dashpot, in few iterations."""

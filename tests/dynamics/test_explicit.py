@@ -44,6 +44,7 @@ def test_a_bar_on_a_wall(dim, law, speed, within):
     assert np.abs(energy - 1).max() < (5e-3 if dim == 2 else 1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("impedance", [1.0, 4.0])
 def test_bars_of_other_impedance(coupling, impedance):
@@ -56,6 +57,7 @@ def test_bars_of_other_impedance(coupling, impedance):
     assert np.abs(energy - 1).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_a_block_slides_where_it_bounces():
     """A block thrown aslant onto a rough plane: friction takes mu times the normal impulse; it ends as by the trapezoidal rule."""
 
@@ -120,6 +122,7 @@ def test_a_step_beyond_the_critical_one():
     next(iter(uem.time_steps(bar.problem, 0.99 * critical, 1.0)))
 
 
+@pytest.mark.slow
 def test_a_thin_layer_at_the_wall():
     """Cells of a hundredth at the wall make contact stiff: steps resolve it from the first touch on, and energy and momentum are right."""
 
@@ -275,6 +278,7 @@ def test_every_step_ends_with_a_check_of_signs(monkeypatch):
     assert pushed == pytest.approx(force, rel=1e-9) and force[-1] > 0.0
 
 
+@pytest.mark.slow
 def test_the_critical_step_is_found_where_cells_change(monkeypatch):
     """A bar of NeoHooke's law that is strained by 3 per cent keeps its critical step, one that is strained by a third does not."""
     found = []

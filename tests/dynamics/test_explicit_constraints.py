@@ -52,6 +52,7 @@ def test_a_rigid_lid_that_is_at_rest_at_first():
     assert problem.dynamics.momentum()[2] == pytest.approx(0.5e-3 * step.time**2, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_a_wave_through_a_tie(coupling):
     """A moving bar tied to one at rest: momentum to rounding, the surfaces together, both as fast after the wave has been to and fro."""
@@ -122,6 +123,7 @@ class Plate:
 SOFT = uem.NeoHooke(900.0, 0.2, kind="plane_strain")
 
 
+@pytest.mark.slow
 def test_a_rigid_plate_that_spins():
     """Momentum to rounding, and two thirds of the square of the angle of a step are lost of the turning, nothing of the flight."""
     spin, turned, left = 5.0, [], []
@@ -142,6 +144,7 @@ def test_a_rigid_plate_that_spins():
     assert 0.0 < left[0] < 0.01 and left[1] <= 0.3 * left[0]
 
 
+@pytest.mark.slow
 def test_a_pendulum():
     """A rigid plate on a hinge falls from the side: its kinetic energy is the work of the weight."""
 
@@ -156,6 +159,7 @@ def test_a_pendulum():
     assert abs(p.couplings[0].rotation) > 0.5 and fallen > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law, rotations", [slow(SOFT, None), (uem.LinearElastic(900.0, 0.0, kind="plane_stress"), "small")])
 def test_a_rigid_head(law, rotations):
     """A block with a rigid head that hits the ground askew rebounds as with implicit steps and massless contactors."""
@@ -195,6 +199,7 @@ def test_a_motor():
     assert p.dynamics.kinetic_energy() > 0.0
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_a_checkpoint(tmp_path):
     """A run with a motor, a rigid head and a hinge that stops and goes on ends as the one that does not."""
     path = COMM.bcast(str(tmp_path / "run.h5") if COMM.rank == 0 else None)

@@ -77,6 +77,7 @@ def test_decay(alpha, contactors):
     assert abs(row.defect) < 0.05 * first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contactors", ["massless", "massy"])
 @pytest.mark.parametrize("b", [0.06, 1.0])
 def test_the_critical_step(b, contactors):

@@ -14,6 +14,7 @@ from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
 COMM = MPI.COMM_WORLD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [uem.NeoHooke, uem.LinearElastic])
 @pytest.mark.parametrize("stop", [9, 15])
 def test_it_goes_on_from_a_checkpoint(tmp_path, law, stop):

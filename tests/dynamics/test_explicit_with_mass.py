@@ -74,6 +74,7 @@ def test_a_bar_on_a_wall(how):
     assert max(abs(row.defect) for row in book.rows) < 0.5 * 0.5 * cell / LENGTH * book.rows[0].kinetic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [None, 2e-3], ids=["longest", "given"])
 @pytest.mark.parametrize("how", [{}, {"lower": True, "general": True}], ids=str)
 def test_rows_of_an_energy_book_that_leaves_steps_out(how, dt):
@@ -181,6 +182,7 @@ def test_a_surface_alone(how):
             assert (one - other).norm() <= 1e-10 * other.norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_discs_that_collide_off_centre(friction):
     """Momentum stays to rounding, moment of momentum to the arc's facets, and energy is lost with the mass of a few nodes alone."""

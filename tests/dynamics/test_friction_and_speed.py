@@ -144,6 +144,7 @@ def test_a_block_on_a_film(coupling, cell):
     assert (np.abs(errors[1]) <= 0.01).all() and (np.abs(errors[1]) <= 0.6 * np.abs(errors[0])).all()
 
 
+@pytest.mark.slow
 def test_a_film_with_a_limit():
     """A traction of at most mu p: the block is slowed down evenly, and then by the film."""
     fast = Slider(uem.ViscousFriction(2.0, mu=0.05), velocity=1.0)

@@ -65,6 +65,7 @@ def swing(t, start, length, radius2):
     return found.y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cell", "meshed"), [("quadrilateral", True), ("quadrilateral", False), slow("hexahedron", True)])
 def test_a_pendulum(cell, meshed):
     """A bar on a hinge falls from the horizontal: angle and energy are right to second order in the step, the bearing's force to first."""
@@ -91,6 +92,7 @@ def test_a_pendulum(cell, meshed):
     assert (second <= np.array([0.3, 0.3, 0.6]) * first).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("meshed", [True, False])
 def test_a_pendulum_on_a_cart(meshed):
     """Equations lead the middle of a bar's end by ``A t^2 / 2``: it falls as in gravity that is oblique, to second order in the step."""
@@ -112,6 +114,7 @@ def test_a_pendulum_on_a_cart(meshed):
     assert errors[1] <= 6e-3 and errors[1] <= 0.3 * errors[0]
 
 
+@pytest.mark.slow
 def test_a_double_pendulum():
     """Two bars on hinges against the equations of Lagrange, both at a distance that is kept."""
     from scipy.integrate import solve_ivp
@@ -166,6 +169,7 @@ def test_a_ball_in_space():
     assert not ball.moment.any() and abs(bar.displacement[2]) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [linear, st_venant])
 def test_a_mass_on_a_spring(law):
     """A slider with a spring, and a spring in its line, swing with the frequency of their stiffness; energy is conserved."""
@@ -189,6 +193,7 @@ def test_a_mass_on_a_spring(law):
         assert abs(row.defect) <= 1e-9
 
 
+@pytest.mark.slow
 def test_a_run_goes_on(folder):
     """From a checkpoint the run goes on to the last bit, with full turns of the hinge, and a step is taken twice."""
 

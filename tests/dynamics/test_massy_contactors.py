@@ -185,6 +185,7 @@ def test_general_contact():
     assert np.diff(energy).max() <= 1e-11 * energy[1] and impulse[1] > 0.5 * np.abs(before).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how", [{}, slow({"coupling": "mortar"}), slow({"cell": "hexahedron", "n": (3, 3)}), slow({"parted": "tied"})]
 )
@@ -203,6 +204,7 @@ def test_friction_never_gives_energy(how):
     assert np.abs(run.defect).max() <= 1e-9 * run.start
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [{"parted": "tied"}, {"parted": "equations"}, {"rigid": 0.5}])
 def test_ties_equations_and_rigid_parts(how):
     """They hold the bodies against contact for whole steps as well, with masses at points."""
@@ -211,6 +213,7 @@ def test_ties_equations_and_rigid_parts(how):
     assert np.abs(run.defect).max() <= 1e-9 * run.start
 
 
+@pytest.mark.slow
 def test_units():
     """The same in millimetres and in kilometres."""
     found = []

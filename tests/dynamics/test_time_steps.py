@@ -248,6 +248,7 @@ def bullet(comm=COMM, size=0.05):
     return problem, contact, X
 
 
+@pytest.mark.slow
 def test_no_step_jumps_through_a_plate():
     """A step of ten times the plate's thickness would end behind it; it is shortened until the block is stopped."""
     problem, contact, X = bullet()
@@ -390,6 +391,7 @@ def test_what_is_refused():
         Bar(4, gravity=(1.0,))
 
 
+@pytest.mark.slow
 def test_a_body_without_mass_is_held_by_others():
     """A massless block between a heavy one and the ground is a spring: the heavy one swings on it with a known frequency."""
     low = box("quadrilateral", [0.0, 0.0], [1.0, 1.0], [4, 4])

@@ -77,6 +77,7 @@ def test_declared_contacts(caplog, coupling):
         assert len(told) == 1 and told[0].startswith("roofs: sharp edges")
 
 
+@pytest.mark.slow
 def test_crossings_without_a_warning(caplog):
     """Edges that are held apart, by equations of their own or at their nodes; parts that never touch; edges that are not sharp; ties."""
     assert warned(caplog, contact=lambda low, high: uem.GeneralContact(max_penetration=1.0)) == []

@@ -13,6 +13,7 @@ from uem_dolfinx.geometry.bodies import carried_along
 from uem_dolfinx.geometry.crossings import find_crossings
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6), g=st.sampled_from([2, 3]), size=st.sampled_from([1e-9, 1.0, 1e6]))
 def test_crossings_are_those_of_a_slow_search(seed, g, size):
     """Times, senses and normals against signs of the height at many instants."""

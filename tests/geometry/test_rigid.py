@@ -312,6 +312,7 @@ def test_turning_tool_without_friction():
     assert forces[0] > 0 and np.ptp(forces) < 1e-9 * forces[0]
 
 
+@pytest.mark.slow
 def test_a_failing_step_leaves_the_tool_to_load():
     """A step beyond all measure is cut until it works, with the tool where ``load`` puts it; one that fails for good restores."""
     places = []

@@ -23,6 +23,7 @@ from uem_dolfinx.geometry.axisymmetry import revolved
 COMM = MPI.COMM_WORLD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell, degree, coupling, rigid, law", [*SCENES[:2], *(slow(*scene) for scene in SCENES[2:])])
 def test_of_second_order(cell, degree, coupling, rigid, law):
     """``J(h) - J(0) - h J'`` vanishes with h^2 for moduli, fields, loads, prescribed values alone and in fields, and the shape."""

@@ -57,6 +57,7 @@ def order_by(s, m, J):
     return uem.taylor_test(anew, slope, 1e-2, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene, sliding, law", [*QUICK, *(slow(*case) for case in CASES if case not in QUICK)])
 def test_of_second_order(scene, sliding, law):
     """``J(h) - J(0) - h J'`` vanishes with h^2 for moduli, fields, loads, prescribed values, and all Constants of the law."""
@@ -117,6 +118,7 @@ def test_closed_form():
     assert -contact.gap.x.array[contact.nodes] == pytest.approx(h * np.log(q / p0 / 2), rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moves", [False, True])
 def test_histories(moves):
     """All steps of a recorded run, in statics and in time, by the modulus and by the Constants of the law."""
@@ -182,6 +184,7 @@ def pushed(bulge):
     return SimpleNamespace(E=E, soft=soft, J=ufl.inner(b.u, b.u) * ufl.dx + b.u[0] * ufl.dx, solve=solve)
 
 
+@pytest.mark.slow
 def test_general_contact():
     """Away from sharp edges, whose areas turn with the normals of the other body: there it is refused."""
     s = pushed(0.5)

@@ -25,6 +25,7 @@ QUICK = [CASES[1], CASES[2]]
 BOTH = pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cell, degree, coupling, rigid, law, measure", QUICK + [slow(*case) for case in CASES if case not in QUICK]
 )

@@ -74,6 +74,7 @@ FLOWS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", FLOWS)
 def test_through_plastic_flow(how):
     """By all parameters of the law, and what leads the block."""
@@ -140,6 +141,7 @@ MOTIONS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", MOTIONS)
 def test_through_motions(how):
     """By what a motion with impact depends on, each alone and all at once: over initial state, damping, density and what shakes the top."""

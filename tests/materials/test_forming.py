@@ -98,6 +98,7 @@ class Upset:
         return [*force, self.law.energy(), self.law.dissipation(), self.contact.dissipation]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cell, coupling",
     [

@@ -39,6 +39,7 @@ def run(folder):
         yield folder, writer
 
 
+@pytest.mark.slow
 def test_histories(run):
     """Reaction and force are opposite, and proportional to the way; any source draws the same."""
     folder, writer = run

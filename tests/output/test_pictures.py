@@ -302,6 +302,7 @@ def test_loop_that_is_left(folder):
     assert not (folder / "c.gif").exists()
 
 
+@pytest.mark.slow
 def test_films_by_ffmpeg(folder):
     """As many frames as steps were drawn."""
     pytest.importorskip("matplotlib")
@@ -335,6 +336,7 @@ def test_films_that_are_refused(folder, monkeypatch):
     refused(uem.OutputError, "cannot be written", film(Path("out") / "a.gif"))
 
 
+@pytest.mark.slow
 def test_panels_and_their_letters(folder):
     """A picture is no wider than a page, and notes where its panels are; they do not overlap and hold all that is drawn."""
     pytest.importorskip("PIL")

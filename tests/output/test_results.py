@@ -183,6 +183,7 @@ def test_vtx_where_there_is_none_is_a_named_error(folder: Path) -> None:
         uem.ResultsWriter(folder / "blocks", pressed("triangle"), vtx=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
 def test_pictures(folder: Path, cell: str) -> None:
     pytest.importorskip("matplotlib")

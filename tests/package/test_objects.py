@@ -132,6 +132,7 @@ def said(script):
     return [line for line in done.stderr.splitlines() if not line.startswith("hwloc")]
 
 
+@pytest.mark.slow
 @serial
 def test_basic_config_of_logging():
     """It has an effect after the import, too, which FFCx 0.5 had prevented; a set-up of the script's own before it is kept."""

@@ -49,6 +49,7 @@ def lengths(steps):
     return np.diff([0.0, *(step.factor for step in steps)])
 
 
+@pytest.mark.slow
 def test_a_forming():
     """Friction and plasticity: errors add up to some times the tolerance, with as few steps as this takes."""
     counts = []
@@ -59,6 +60,7 @@ def test_a_forming():
     assert 3 <= counts[0] < counts[1] <= 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [lambda f: 1 - (1 - f) ** 4, lambda f: f**4], ids=["early", "late"])
 def test_steps_are_doubled_in_load(path):
     """Steps are short where much happens, and few are refused: fewer of them than equal ones of the same error."""
@@ -141,6 +143,7 @@ def test_without_history():
     assert np.abs(found[0] - found[1]).max(initial=0.0) <= 1e-8 * COMM.allreduce(np.abs(found[0]).max(initial=0.0))
 
 
+@pytest.mark.slow
 def test_a_refused_step_leaves_nothing():
     """After a tolerance that no step reaches the body goes on as another that has not tried."""
     problem, new = forming(COMM).problem, forming(COMM).problem
@@ -162,6 +165,7 @@ def test_what_is_refused():
     refused(uem.InputError, "arc_length", lambda: uem.load_steps(problem, 1, tolerance=0.1, arc_length=True))
 
 
+@pytest.mark.slow
 def test_gone_on_with(folder):
     """A run that is left and gone on with takes the same steps to the same end."""
     whole, steps = formed(1, 1e-3)

@@ -282,6 +282,7 @@ def test_scenes_that_went_in_circles(make, how, most):
     assert sum(step.newton_iterations + step.exchanges for step in steps) <= most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize(
     ("cell", "n", "ratio", "mu"),

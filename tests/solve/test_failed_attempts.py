@@ -70,6 +70,7 @@ def test_a_failed_attempt_leaves_nothing(name):
         alike(after[3], alone[3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "cell", "mu", "law"),
     [

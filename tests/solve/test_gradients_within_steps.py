@@ -169,6 +169,7 @@ WAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [pytest.param(way, id=way.__name__) for way in WAYS])
 @pytest.mark.parametrize("size", [1.0, slow(1e-9), slow(1e3)])
 def test_shares(way, size, tmp_path):

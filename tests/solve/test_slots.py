@@ -392,6 +392,7 @@ def states_that_hold(p):
             yield np.array(state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rest", [0.0, 0.3])
 def test_all_states(rest):
     """A state is found where one of all states holds. With limits at no normal force, which end where contactors open, often none does."""
@@ -411,6 +412,7 @@ def test_all_states(rest):
     assert missed == without == 0 if rest == 0 else missed <= 4 < without, (missed, without)
 
 
+@pytest.mark.slow
 def test_from_motions_with_dampers():
     """Of nearly loose contactors on springs Newton's method from rest solves less than half; from motions with dampers eight of ten."""
     found = []
