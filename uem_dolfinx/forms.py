@@ -359,7 +359,7 @@ def assemble_array(V: Any, L: Any) -> npt.NDArray[np.float64]:
 
 def assemble_scalar(M: Any, comm: MPI.Comm) -> float:
     """Sum of a compiled functional over all ranks of a communicator, known to all of them (collective)."""
-    return float(reduced(comm, sum(fem.assemble_scalar(part) for part in parts_of(M)), op=MPI.SUM))
+    return float(reduced(comm, sum([fem.assemble_scalar(part) for part in parts_of(M)]), op=MPI.SUM))
 
 
 class Vector(PETSc.Vec):

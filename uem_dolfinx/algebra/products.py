@@ -111,7 +111,7 @@ class UnitedMatrix(Returning):
         self._bring_values()
         values, g, nodes = self._A.values, self.space.block, P.united
         idle = (g * nodes[:, None] + np.arange(g))[~P.used[nodes]].astype(np.int64)
-        held, own = (entries.find(idle, idle + self._first)[0] for entries in (self._A, self._K))
+        held, own = [entries.find(idle, idle + self._first)[0] for entries in (self._A, self._K)]
         self._changed = changes._replace(value=np.zeros(0)), lines, held, own
         changes.value[adding] += values[_along(lines[adding], g)]
         values[_along(lines, g)] = changes.value

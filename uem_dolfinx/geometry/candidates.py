@@ -51,7 +51,7 @@ def candidate_pairs(
         far = 4.0 * float(np.ptp(np.concatenate([points, middle]), axis=0).sum() + radius.max())
         places, middles = np.column_stack([points, far * asked]), np.column_stack([middle, far * surface])
     if len(places) * len(middles) <= ALL_PAIRS:
-        distance = np.sqrt(sum((places[:, None, k] - middles[:, k]) ** 2 for k in range(places.shape[1])))
+        distance = np.sqrt(sum([(places[:, None, k] - middles[:, k]) ** 2 for k in range(places.shape[1])]))
         bound = distance.min(axis=1) * (1 + EQUALLY_NEAR)
         i, f = np.nonzero(distance <= bound[:, None] + radius)
     else:

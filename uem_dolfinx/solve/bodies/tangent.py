@@ -214,7 +214,7 @@ def curvature_of(
         whole = apart or (i >= contacts and not convex and is_skew(blocks))
         parts[i] = nodes, blocks if whole else 0.5 * (blocks + blocks.transpose(0, 2, 1))
     # it vanishes e.g. for a plane
-    if not reduced(du.comm.tompi4py(), any(blocks.any() for _, blocks in parts)):
+    if not reduced(du.comm.tompi4py(), any([blocks.any() for _, blocks in parts])):
         return None
     return contact_curvature(parts, du)
 
@@ -243,7 +243,7 @@ def slip_terms(
         Matrix and vector, each None if it vanishes.
     """
     g, comm = du.getBlockSize(), du.comm.tompi4py()
-    parts = [terms for terms in (pair.slip_terms(convex) for pair in pairs) if terms is not None]
+    parts = [terms for pair in pairs if (terms := pair.slip_terms(convex)) is not None]
     heat = [part for pair in pairs for one in pair.heats for part in one.tangent()]
     slips = bool(parts) and reduced(comm, sum(len(nodes) for nodes, _, _ in parts)) > 0
     passes = bool(heat) and reduced(comm, sum(len(nodes) for nodes, _ in heat)) > 0
