@@ -19,10 +19,7 @@ NO_COMPONENT = 1e-12
 
 def node_of(deck: Deck, where: str) -> str:
     """A set as it is, and a node as the set of its own."""
-    if not where.isdigit():
-        return where
-    # reference nodes of sections belong to no body
-    return deck.name_node(int(where)) if int(where) in deck.nodes else f"node {int(where)}"
+    return deck.name_node(int(where)) if where.isdigit() else where
 
 
 def nodes_of(deck: Deck, where: str) -> list[Any]:
@@ -76,11 +73,14 @@ class Closing:
         bodies = all(name.startswith(("C3D", "CP", "CAX")) for name in self.model.types)
         if bodies and (bare := set(deck.elements).difference(count)):
             raise InputError(f"element {min(bare)} has no *SOLID SECTION: expected a material of all elements")
-        self._lead_rigid()
         self._turn()
+        references = self.model.references
         held, forces, pressures = ([getattr(step, what) for step in steps] for what in ("held", "forces", "pressures"))
         for step in steps:
-            step.held, step.forces, step.pressures = {}, {}, {}
+            step.held, step.forces = (
+                {at: acting.pop(at) for at in list(acting) if at[0] in references} for acting in (step.held, step.forces)
+            )
+            step.pressures = {}
         for (where, dof), history in self._in_sets(held):
             self._give("held", (self._named("held", where), dof), history)
         by_node: dict[Any, dict[int, list[Value | None]]] = {}
@@ -97,23 +97,14 @@ class Closing:
                 deck.surfaces[name] = (True, [list(side) for side in group])
             self._give("pressures", (name, "P"), of_sides[group[0]])
 
-    def _lead_rigid(self) -> None:
-        """Part values at reference nodes of rigid bodies from the others."""
-        references = self.model.references
-        for step in self.model.steps:
-            for what in ("held", "forces"):
-                own: Acting = getattr(step, what)
-                step.motions |= {(what, *where): own.pop(where) for where in list(own) if where[0] in references}
-        self._sets = {at: None for at in self._sets if not (at[0].isdigit() and int(at[0]) in references)}
-
     def _turn(self) -> None:
-        """Let values in local directions be those in global ones, and terms of equations vectors."""
+        """Let values in local directions be those in global ones, forces those of a thickness of 1, and terms of equations vectors."""
         for step in self.model.steps:
             turned: Acting = {}
             for (one, dof), value in step.forces.items():
                 for c, part in enumerate(self._axis(one, dof), 1):
                     if part:
-                        turned[one, c] = together(turned.get((one, c), 0.0), value * part, one)
+                        turned[one, c] = together(turned.get((one, c), 0.0), value * float(part / self.model.thickness), one)
             step.forces = turned
         self._turn_held()
         for equation in self.model.equations:
@@ -160,7 +151,7 @@ class Closing:
         for where, dof in self._sets:
             nodes = nodes_of(self._deck, where)
             own = set(nodes)
-            # reference nodes of sections are no nodes of a body
+            # values at reference nodes are no values of bodies
             if all(by_node.get((one, dof)) == by_node.get((nodes[0], dof)) is not None for one in nodes):
                 yield (where if not where.isdigit() else [int(where)], dof), by_node[nodes[0], dof]
                 left = {at: history for at, history in left.items() if at[1] != dof or at[0] not in own}

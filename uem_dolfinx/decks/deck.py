@@ -87,7 +87,7 @@ class Deck(given.Sealed):
         self._old = fem.Function(V)
         self.contacts = {f"{pair.slave} on {pair.master}": self._contact(pair) for pair in model.pairs}
         self.sections = {name: self._section(name, node, axis) for name, node, axis in model.pretension}
-        held = dict.fromkeys(where for step in model.steps for where in step.held if not self._is_reference(where[0]))
+        held = dict.fromkeys(where for step in model.steps for where in step.held if isinstance(where[0], str))
         self._bcs = {where: self._condition(where) for where in held}
         dynamics = self._dynamics(V)
         self.problem = UnitedProblem(
@@ -111,7 +111,7 @@ class Deck(given.Sealed):
     # -- for users -------------------------------------------------------------------------------------------------------
 
     def run(self) -> Iterator[LoadStep | TimeStep]:
-        """Take all steps, one converged load step or step of time after the other (collective); errors as of ``load_steps``."""
+        """Take all steps, one converged load step or step of time after the other (collective); errors as in ``load_steps``."""
         for k, step in enumerate(self.steps if self.problem.dynamics is not None else ()):
             yield from time_steps(self.problem, step.first, float(self._ends[k]))
         if self.problem.dynamics is not None:
@@ -119,7 +119,7 @@ class Deck(given.Sealed):
         yield from load_steps(self.problem, [one for k, step in enumerate(self.steps) for one in self._stages(k, step)])
 
     def modes(self) -> Vibrations:
-        """As many modes as ``*FREQUENCY`` wants, about the present state; InputError without it, or densities (collective)."""
+        """The modes that ``*FREQUENCY`` requests, about the present state; InputError without it, or densities (collective)."""
         if not self._model.modes:
             raise InputError("modes: the deck has no step *FREQUENCY")
         mass = consistent_mass(self.problem.config.V, self._density("vibrations need"))
@@ -268,9 +268,6 @@ class Deck(given.Sealed):
             raise TagError(f"the deck mentions '{name}', which has no node or side of a body: {self.tags!r}")
         return self._by_name[name.upper()]
 
-    def _is_reference(self, where: str) -> bool:
-        return any(where == f"node {int(node)}" for _, node, _ in self._model.pretension)
-
     def _condition(self, where: tuple[str, int]) -> fem.DirichletBC:
         (name, dof), V = where, self.u.function_space
         if dof == TEMPERATURE:
@@ -289,11 +286,11 @@ class Deck(given.Sealed):
         return Equation(terms, b=b)
 
     def _point_loads(self) -> list[PointLoad]:
-        g, t, found = self.mesh.geometry.dim, self._model.thickness, []
-        for name in dict.fromkeys(name for step in self.steps for name, _ in step.forces if not self._is_reference(name)):
+        g, found = self.mesh.geometry.dim, []
+        for name in dict.fromkeys(name for step in self.steps for name, _ in step.forces if isinstance(name, str)):
             force = fem.Constant(self.mesh, np.zeros(g))
             for c in range(g):
-                self._drive(force.value[c : c + 1], [step.forces.get((name, c + 1), 0.0) / t for step in self.steps])
+                self._drive(force.value[c : c + 1], [step.forces.get((name, c + 1), 0.0) for step in self.steps])
             found.append(PointLoad(self._tag(name), force))
         return found
 
@@ -305,9 +302,8 @@ class Deck(given.Sealed):
         # rotations of a node of translations and rotations, or those of a node of their own
         places = [(node, c) for c in range(1, g + 1)] + [(turning, c) if turning else (node, 3 + c) for c in turns]
         for driven, at in zip([*force.value[:, None], *np.reshape(moment.value, (-1, 1))], places):
-            loads = [step.motions.get(("forces", *at), 0.0) / self._model.thickness for step in self.steps]
-            self._drive(driven, loads)
-            held = [step.motions.get(("held", *at)) for step in self.steps]
+            self._drive(driven, [step.forces.get(at, 0.0) for step in self.steps])
+            held = [step.held.get(at) for step in self.steps]
             if (fixed := [value for value in held if value is not None]) and len(fixed) < len(held):
                 raise InputError(f"*BOUNDARY of node {at[0]}, of a *RIGID BODY: expected it in all steps, or in none")
             motion.append(fem.Constant(self.mesh, 0.0) if fixed else None)
@@ -316,11 +312,10 @@ class Deck(given.Sealed):
         led = motion if any(one is not None for one in motion) else None
         return RigidCoupling(self._tag(name), place[:g], force=force, moment=moment, motion=led)
 
-    def _section(self, name: str, node: str, axis: list[float]) -> Preload:
-        g, reference, now = self.mesh.geometry.dim, (f"node {int(node)}", 1), np.zeros(1)
-        pulled = any(reference in step.forces for step in self.steps)
-        t = self._model.thickness if pulled else 1.0
-        self._drive(now, [(step.forces if pulled else step.held).get(reference, 0.0) / t for step in self.steps])
+    def _section(self, name: str, node: int, axis: list[float]) -> Preload:
+        g, now = self.mesh.geometry.dim, np.zeros(1)
+        pulled = any((node, 1) in step.forces for step in self.steps)
+        self._drive(now, [(step.forces if pulled else step.held).get((node, 1), 0.0) for step in self.steps])
         led: dict[str, Any] = {"force" if pulled else "shortening": lambda s: float(now[0])}
         direction = axis[:g] if any(axis[:g]) else None
         self.left_out += [f"heat through the section '{name}': none passes its cut"] if self._model.thermal else []
@@ -346,8 +341,9 @@ class Deck(given.Sealed):
             hard = ", as friction does not go with soft contact" if self._soft and friction else ""
             self.left_out.append(f"PRESSURE-OVERCLOSURE={law.overclosure} of '{name}': contact is hard{hard}")
         if law.conductance and self._model.thermal:
-            h = law.conductance[0][0]
-            how["heat"] = Conductance(lambda p, g: np.where(g <= CONDUCTS * self.problem.config.size, h, 0.0), field=1)
+            how["heat"] = Conductance(
+                lambda p, g: np.where(g <= CONDUCTS * self.problem.config.size, law.conductance, 0.0), field=1
+            )
         return Contact(slave, master, **how)
 
     # -- the form --------------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from uem_dolfinx.decks.parts import (
     together,
 )  # fmt: skip
 from uem_dolfinx.errors import InputError
-from uem_dolfinx.geometry.decks import Deck
+from uem_dolfinx.geometry.decks import Deck, numbers_of
 
 #: Requests of output and settings of the solver, which have no part in the model.
 OUTPUT = (
@@ -36,8 +36,11 @@ OUTPUT = (
 OTHERWISE = r"\d[RI]|C3D20|C(PS|PE|AX)8"
 #: Names of Abaqus for degrees of freedom that are held, from the first to the last.
 NAMED_HOLDS = {"ENCASTRE": ("1", "6"), "PINNED": ("1", "3"), "XSYMM": ("1", "1"), "YSYMM": ("2", "2"), "ZSYMM": ("3", "3")}
-#: Keywords of a material with one number.
-NUMBERS = {"DENSITY": "density", "EXPANSION": "expansion", "CONDUCTIVITY": "conductivity", "SPECIFIC HEAT": "heat_capacity"}
+#: Keywords of a material, and of an interaction, with one number.
+NUMBERS = {
+    "DENSITY": "density", "EXPANSION": "expansion", "CONDUCTIVITY": "conductivity", "SPECIFIC HEAT": "heat_capacity",
+    "GAP CONDUCTANCE": "conductance",
+}  # fmt: skip
 #: Options that are taken, or that change nothing here; all others are left out.
 KNOWN_OPTIONS = {
     "ELASTIC": "TYPE", "EXPANSION": "TYPE ZERO", "SOLID SECTION": "ELSET MATERIAL ORIENTATION OFFSET", "MATERIAL": "NAME",
@@ -81,7 +84,7 @@ class _Reader:
         elif keyword in STEP_KINDS and self._perturbs:
             self.model.left_out.append("PERTURBATION of *STEP")
         if keyword in STEP_KINDS:
-            times = [*_numbers(rows[0] if rows else []), 0.0, 0.0]
+            times = [*numbers_of(rows[0] if rows else []), 0.0, 0.0]
             duration = times[1] or 1.0
             self._step.kind, self._step.first, self._step.duration = keyword, times[0] or duration, duration
             self._step.steady, self._step.direct = "STEADY STATE" in options, "DIRECT" in options
@@ -93,7 +96,7 @@ class _Reader:
         if keyword in ("ELASTIC", *NUMBERS) and not (kind := options.get("TYPE", "ISO").upper()).startswith("ISO"):
             raise InputError(f"TYPE={kind}: expected ISO, an isotropic material")
         if keyword in NUMBERS:
-            setattr(self._material, NUMBERS[keyword], _numbers(rows[0])[0])
+            setattr(self._interaction if keyword.startswith("GAP") else self._material, NUMBERS[keyword], numbers_of(rows[0])[0])
             return len(rows) == 1
         # *DSLOAD is read as *DLOAD
         name = keyword.replace("DSLOAD", "DLOAD").replace(" ", "_").replace("-", "_").lower()
@@ -107,7 +110,7 @@ class _Reader:
         self._material = self.model.materials.setdefault(name, Material(name))
 
     def read_elastic(self, options: Options, rows: Rows) -> bool:
-        self._material.elastic = _numbers(rows[0])[0], _numbers(rows[0])[1]
+        self._material.elastic = numbers_of(rows[0])[0], numbers_of(rows[0])[1]
         return len(rows) == 1
 
     def read_damping(self, options: Options, rows: Rows) -> None:
@@ -115,7 +118,7 @@ class _Reader:
 
     def read_solid_section(self, options: Options, rows: Rows) -> None:
         plane = any(name.startswith(("CPS", "CPE")) for name in self.model.types)
-        t = (plane and rows and _numbers(rows[0])[0]) or 1.0
+        t = (plane and rows and numbers_of(rows[0])[0]) or 1.0
         if self.model.sections and t != self.model.thickness:
             raise InputError(f"thicknesses {self.model.thickness} and {t}: expected one for all plane bodies")
         self.model.thickness = t
@@ -126,10 +129,10 @@ class _Reader:
 
     def read_surface_behavior(self, options: Options, rows: Rows) -> None:
         self._interaction.overclosure = options.get("PRESSURE-OVERCLOSURE", "HARD").upper()
-        self._interaction.numbers = [_numbers(row) for row in rows]
+        self._interaction.numbers = [numbers_of(row) for row in rows]
 
     def read_friction(self, options: Options, rows: Rows) -> None:
-        mu = _numbers(rows[0])[0]
+        mu = numbers_of(rows[0])[0]
         if self._step is self._begin:
             self._interaction.friction = mu
         elif not self._changed:
@@ -141,10 +144,6 @@ class _Reader:
         self._changed = options["INTERACTION"].upper()
         if self._changed not in self.model.interactions:
             raise InputError(f"there is no interaction '{self._changed}': expected one of {', '.join(self.model.interactions)}")
-
-    def read_gap_conductance(self, options: Options, rows: Rows) -> bool:
-        self._interaction.conductance = [_numbers(row) for row in rows]
-        return len(rows) == 1
 
     # -- the model -------------------------------------------------------------------------------------------------------
 
@@ -179,13 +178,13 @@ class _Reader:
             left = left[3 * n :]
 
     def read_pre_tension_section(self, options: Options, rows: Rows) -> None:
-        self.model.pretension.append((options["SURFACE"], options["NODE"], _numbers(rows[0])[:3] if rows else []))
+        self.model.pretension.append((options["SURFACE"], int(options["NODE"]), numbers_of(rows[0])[:3] if rows else []))
 
     def read_initial_conditions(self, options: Options, rows: Rows) -> bool:
         if (kind := options["TYPE"].upper()) == "VELOCITY":
-            self.model.velocities |= {(node_of(self._deck, row[0]), int(row[1])): _numbers(row[2:])[0] for row in rows}
+            self.model.velocities |= {(node_of(self._deck, row[0]), int(row[1])): numbers_of(row[2:])[0] for row in rows}
         elif kind == "TEMPERATURE":
-            _last(self.model.initial, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
+            _last(self.model.initial, {node_of(self._deck, row[0]): numbers_of(row[1:])[0] for row in rows})
         return kind in ("VELOCITY", "TEMPERATURE")
 
     def read_rigid_body(self, options: Options, rows: Rows) -> None:
@@ -196,14 +195,14 @@ class _Reader:
         )
 
     def read_transform(self, options: Options, rows: Rows) -> None:
-        kind, numbers = options.get("TYPE", "R").upper(), [float(value) for row in rows for value in row if value]
+        kind, numbers = options.get("TYPE", "R").upper(), numbers_of([value for row in rows for value in row if value])
         if kind not in ("R", "C") or len(numbers) != 6:
             raise InputError(f"TYPE={kind} with {len(numbers)} numbers: expected R or C, with two points")
         for one in nodes_of(self._deck, options["NSET"]):
             self.axes[one] = local_axes(kind, numbers, self._deck.nodes[one])
 
     def read_amplitude(self, options: Options, rows: Rows) -> None:
-        numbers = [float(value.lower().replace("d", "e")) for row in rows for value in row if value]
+        numbers = numbers_of([value for row in rows for value in row if value])
         points = tuple(zip(numbers[::2], numbers[1::2]))
         times = [time for time, _ in points]
         if "USER" in options or options.get("DEFINITION", "TABULAR").upper() != "TABULAR":
@@ -215,7 +214,7 @@ class _Reader:
 
     def _value(self, text: str, options: Options) -> Value:
         """A number of a row, which follows the amplitude in the options, if there is one."""
-        value, name = _numbers([text])[0], options.get("AMPLITUDE", "").upper()
+        value, name = numbers_of([text])[0], options.get("AMPLITUDE", "").upper()
         if not name:
             return value
         if name not in self._amplitudes:
@@ -245,7 +244,7 @@ class _Reader:
         self._own.add((kind, *where))
 
     def _has(self, where: str, dof: int, value: float, keyword: str) -> bool:
-        """Whether a set has a degree of freedom; rotations, and motions out of the plane, are none but of rigid bodies."""
+        """Whether a set has a degree of freedom; only reference nodes have rotations, and motions out of the plane."""
         if dof <= 6 and where.isdigit() and int(where) in self.model.references:
             return True
         if dof <= self._dim or (dof == TEMPERATURE and self.model.thermal):
@@ -264,14 +263,14 @@ class _Reader:
             where, first, last, value = [*row, "", ""][:4]
             first, last = NAMED_HOLDS.get(first.upper(), (first, last))
             for dof in range(int(first), int(last or first) + 1):
-                if self._has(where, dof, _numbers([value])[0], "BOUNDARY"):
+                if self._has(where, dof, numbers_of([value])[0], "BOUNDARY"):
                     self.sets[where, dof] = None
                     self._step.held |= {(one, dof): self._value(value, options) for one in nodes_of(self._deck, where)}
 
     def read_cload(self, options: Options, rows: Rows) -> None:
         self._begins("CLOAD", options, self._step.forces)
         for where, dof, value in (row[:3] for row in rows):
-            if self._has(where, int(dof), _numbers([value])[0], "CLOAD"):
+            if self._has(where, int(dof), numbers_of([value])[0], "CLOAD"):
                 for one in nodes_of(self._deck, where):
                     self._add("CLOAD", self._step.forces, (one, int(dof)), self._value(value, options))
 
@@ -281,13 +280,13 @@ class _Reader:
         for elements, label, value, *numbers in of_bodies:
             if elements.isdigit():
                 self._deck.elsets.setdefault(f"ELEMENT {elements}", (f"element {elements}", [int(elements)]))
-            where = f"element {elements}" if elements.isdigit() else elements, BodyLoad.of(label.upper(), _numbers(numbers))
+            where = f"element {elements}" if elements.isdigit() else elements, BodyLoad.of(label.upper(), numbers_of(numbers))
             self._add("DLOAD", self._step.bodies, where, self._value(value, options))
         pressing = [row for row in rows if re.fullmatch(r"P\d?", row[1].upper())]
-        for who, label, value in (row[:3] for row in pressing):
-            of_elements, sides = self._deck.surfaces.get(who, (False, []))
+        for name, label, value in (row[:3] for row in pressing):
+            of_elements, sides = self._deck.surfaces.get(name, (False, []))
             if label[1:] or not (of_elements and all(side for _, side in sides)):
-                sides = [[who, f"S{label[1:]}" if label[1:] else ""]]
+                sides = [[name, f"S{label[1:]}" if label[1:] else ""]]
             for member, side in sides:
                 own = self._deck.elsets.get(member.upper(), ("", [member]))[1] if side else [member]
                 for one in own:
@@ -296,7 +295,7 @@ class _Reader:
 
     def read_temperature(self, options: Options, rows: Rows) -> None:
         self._begins("TEMPERATURE", options, self._step.temperatures)
-        _last(self._step.temperatures, {node_of(self._deck, row[0]): _numbers(row[1:])[0] for row in rows})
+        _last(self._step.temperatures, {node_of(self._deck, row[0]): numbers_of(row[1:])[0] for row in rows})
 
     def read_model_change(self, options: Options, rows: Rows) -> bool:
         if options.get("TYPE", "").upper() != "CONTACT PAIR":
@@ -306,7 +305,7 @@ class _Reader:
 
 
 def _kept(acting: Acting, last: Step) -> Acting:
-    """What acts on from a step: values that followed its time stay as they were at its end."""
+    """Values that act on after a step: values that followed its time stay as they were at its end."""
     followed = {w: v.at(last.duration, 0.0) for w, v in acting.items() if isinstance(v, Course) and not v.total}
     return acting | followed
 
@@ -346,8 +345,3 @@ def model_of(deck: Deck) -> Model:
     Closing(deck, reader.model, reader.sets, reader.axes).close()
     left_out[:] = dict.fromkeys(left_out)
     return reader.model
-
-
-def _numbers(row: list[str]) -> list[float]:
-    """Numbers of a row; empty places are 0."""
-    return [float(value.lower().replace("d", "e") or 0.0) for value in row]

@@ -25,8 +25,8 @@ SAME_LENGTH = 1e-6
 #: [convention; duration of the step; test_deck_runs.py::test_heat_in_steps_of_time]
 LEAST_STEPS = 10
 
-#: A set or a node, by name, and a degree of freedom, or the label of a load.
-Where: TypeAlias = tuple[str, Any]
+#: A set by name, or a reference node by number, and a degree of freedom, or the label of a load.
+Where: TypeAlias = tuple[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,6 @@ class Course:
     def at(self, time: float, total: float) -> float:
         """The value at a time of the step and in all."""
         return self.value * float(np.interp(total if self.total else time, *np.transpose(self.points)))
-
-    def __truediv__(self, divisor: float) -> Course:
-        """The value divided by a number."""
-        return replace(self, value=self.value / divisor)
 
     def __mul__(self, factor: float) -> Course:
         """The value times a number."""
@@ -113,7 +109,7 @@ class Interaction:
     overclosure: str = "HARD"
     numbers: list[list[float]] = field(default_factory=list)
     friction: float = 0.0
-    conductance: list[list[float]] = field(default_factory=list)
+    conductance: float = 0.0
 
     def soft(self) -> SoftContact:
         """Its law of pressure; InputError for another word than those of CalculiX."""
@@ -161,14 +157,12 @@ class Step:
     direct: bool = False
     alpha: float = -0.05  # of the Hilber-Hughes-Taylor method, in ``*DYNAMIC``
     held: dict[Where, Value] = field(default_factory=dict)
-    forces: dict[Where, Value] = field(default_factory=dict)
+    forces: dict[Where, Value] = field(default_factory=dict)  # for a thickness of 1
     pressures: dict[Where, Value] = field(default_factory=dict)
     bodies: dict[tuple[str, BodyLoad], Value] = field(default_factory=dict)
     temperatures: dict[str, float] = field(default_factory=dict)
     contacts: dict[tuple[str, str], bool] = field(default_factory=dict)
     friction: dict[str, float] = field(default_factory=dict)  # coefficients that change, by the names of interactions
-    # values of ``held`` and ``forces`` at reference nodes of rigid bodies, by these words, node and degree of freedom
-    motions: dict[tuple[str, int, int], Value] = field(default_factory=dict)
 
     def times(self) -> Iterator[tuple[float, float]]:
         """Beginnings and ends of steps of time, which grow."""
@@ -196,15 +190,15 @@ class Model:
     #: set, position, and nodes of translation and rotation of each rigid body.
     rigid: list[tuple[str, list[float], int, int]] = field(default_factory=list)
     #: surface, reference node and axis of each section of a bolt.
-    pretension: list[tuple[str, str, list[float]]] = field(default_factory=list)
+    pretension: list[tuple[str, int, list[float]]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     modes: int = 0  # number of vibrations that are wanted after the last step; 0 for none
     left_out: list[str] = field(default_factory=list)  # what has no counterpart here, or is read otherwise than it stands
 
     @property
     def references(self) -> set[int]:
-        """Reference nodes of rigid bodies."""
-        return {node for _, _, *nodes in self.rigid for node in nodes}
+        """Reference nodes of rigid bodies and of sections of bolts."""
+        return {node for _, _, *nodes in self.rigid for node in nodes} | {node for _, node, _ in self.pretension}
 
     @property
     def thermal(self) -> bool:

@@ -23,13 +23,13 @@ from uem_dolfinx.log import logger
 def read_deck(path: str | Path, comm: MPI.Comm, *, soft: bool = False) -> Deck:
     """Read a deck of Abaqus or CalculiX with its materials, conditions, contacts, steps and loads as a problem (collective).
 
-    Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements;
-    ``*BOUNDARY``, ``*CLOAD``, pressures, ``GRAV`` and ``CENTRIF`` by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE``, ``*EQUATION``,
-    ``*CONTACT PAIR``, ``*TIE``, ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL CHANGE`` of
-    contact pairs, ``*RIGID BODY`` and ``*PRE-TENSION SECTION``, whose surface is cut; values that follow an ``*AMPLITUDE``, or are in
-    the directions of a ``*TRANSFORM``; steps ``*STATIC``, ``*HEAT TRANSFER``, ``*COUPLED TEMPERATURE-DISPLACEMENT``, ``*FREQUENCY`` and
-    ``*DYNAMIC``, implicit with increments of one length, with ``*DAMPING`` and initial velocities. Cells of several kinds, prisms and
-    pyramids are divided into simplices.
+    Read are linear elastic materials with expansion, conduction and heat capacity, in small or, with ``NLGEOM``, large displacements.
+    So are ``*BOUNDARY``, ``*CLOAD``, pressures, ``GRAV`` and ``CENTRIF`` by ``*DLOAD`` and ``*DSLOAD``, ``*TEMPERATURE`` and
+    ``*EQUATION``; ``*CONTACT PAIR``, ``*TIE``, ``*FRICTION``, ``*GAP CONDUCTANCE``, ``*CHANGE FRICTION``, which is ramped, ``*MODEL
+    CHANGE`` of contact pairs, ``*RIGID BODY`` and ``*PRE-TENSION SECTION``, whose surface is cut. Values may follow an ``*AMPLITUDE``, or
+    be in the directions of a ``*TRANSFORM``. Steps are ``*STATIC``, ``*HEAT TRANSFER``, ``*COUPLED TEMPERATURE-DISPLACEMENT``,
+    ``*FREQUENCY`` and ``*DYNAMIC``, which is implicit with increments of one length, ``*DAMPING`` and initial velocities. Cells of several
+    kinds, prisms and pyramids are divided into simplices.
     All else is in ``left_out`` and in the log.
 
     Args:

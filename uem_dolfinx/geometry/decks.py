@@ -157,7 +157,7 @@ def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str
     if keyword == "NODE":
         of_block = [int(row[0]) for row in rows]
         for row in rows:
-            x = [float(value.lower().replace("d", "e") or 0.0) for value in row[1:4]]
+            x = numbers_of(row[1:4])
             _once(deck.nodes, "node", int(row[0]), x + [0.0] * (3 - len(x)))
         if "NSET" in options:
             _named(deck.nsets, options["NSET"]).extend(of_block)
@@ -177,6 +177,11 @@ def _take(deck: Deck, keyword: str, options: dict[str, str], rows: list[list[str
         deck.surfaces[options["NAME"]] = (of_elements, [[*row, ""][:2] for row in rows])
     elif keyword:
         deck.cards.append((keyword, options, rows))
+
+
+def numbers_of(row: list[str]) -> list[float]:
+    """Numbers of a row; empty places are 0."""
+    return [float(value.lower().replace("d", "e") or 0.0) for value in row]
 
 
 def _generated(first: int, last: int, step: int = 1) -> range:
@@ -265,12 +270,12 @@ def _found(deck: Deck) -> Found:
     sides = _Sides(found, of_kind)
     for name, (of_elements, rows) in deck.surfaces.items():
         if of_elements:
-            own = [(np.array(_members(deck.elsets, who), dtype=np.int64), side.upper()) for who, side in rows]
+            own = [(np.array(_members(deck.elsets, part), dtype=np.int64), side.upper()) for part, side in rows]
             for some, _ in own:
                 _places(elements, some, "element", f"the surface '{name}' holds")
             found.sides[name] = sides.of(name, own)
         else:
-            nodes = [number for who, _ in rows for number in _members(deck.nsets, who)]
+            nodes = [number for part, _ in rows for number in _members(deck.nsets, part)]
             point_sets[name] = _places(numbers, np.unique(nodes).astype(np.int64), "node", f"the surface '{name}' holds")
     return found
 
@@ -305,14 +310,15 @@ class _Sides:
                 which = np.flatnonzero(np.isin(own, elements))
                 if not len(which) or block.dim == 1:
                     continue
-                for found in self._free(block, which) if not side else [self._named(surface, block, which, side)]:
+                named = side or block.dim < self._found.dim
+                for found in [self._named(surface, block, which, side)] if named else self._free(block, which):
                     rows.setdefault(found.shape[1], []).append(found)
         return [np.concatenate(parts) for parts in rows.values()]
 
     def _named(self, surface: str, block: Block, which: Ints, side: str) -> Ints:
-        """Vertices of one side of some cells ``(n, k)``."""
+        """Vertices of one side of some cells, or of surface elements ``(n, k)``."""
         sides = KINDS[block.base].sides
-        if block.dim < self._found.dim and side in ("SPOS", "SNEG"):
+        if block.dim < self._found.dim and side in ("", "SPOS", "SNEG"):
             return block.data[which, : KINDS[block.base].vertices]
         if not re.fullmatch(r"S\d", side) or not 1 <= int(side[1]) <= len(sides):
             raise ValueError(f"the surface '{surface}' has the side {side} of {block.type}: expected S1 to S{len(sides)}")
@@ -333,8 +339,6 @@ class _Sides:
 
     def _free(self, block: Block, which: Ints) -> list[Ints]:
         """Vertices of the sides of some cells that belong to no other cell."""
-        if block.dim < self._found.dim:
-            return [block.data[which, : KINDS[block.base].vertices]]
         found = []
         for side in KINDS[block.base].sides:
             rows, single = block.data[which[:, None], list(side)], self._single[len(side)]
