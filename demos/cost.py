@@ -21,7 +21,7 @@ Options:
 #
 # Linear bodies slide little (`sliding="small"`); bodies at finite strain, neo-Hookean, slide as far as they like. Then one united solve to
 # 1e-8 is looked at: how many iterations CG with multigrid takes for more and more unknowns, and for a sphere that is stiffer than the
-# block. Forms were compiled before. Lists are parted by commas, so that `--linear 3:100000,3:500000` asks for two sizes in 3D.
+# block. Forms were compiled before. Lists are parted by commas, so that `--linear 3:100000,3:500000` means two sizes in 3D.
 
 # %%
 import time

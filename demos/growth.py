@@ -14,7 +14,7 @@ Options:
 # %% [markdown]
 # # What grows with the ranks
 #
-# Two blocks are pressed onto each other and sheared. In the second of two load steps every call of MPI is counted, whoever makes it,
+# Two blocks are pressed onto each other and sheared. In the second of two load steps every call of MPI is counted, in all libraries,
 # with its bytes, by stages of the solution. The linear solver's are PETSc's and hypre's; the rest is counted as that of bodies and contact.
 # Counts are those of the busiest rank, over the number of linearisations: iterations and exchanges of the active set.
 #

@@ -32,8 +32,8 @@ Options:
 # Times are those of the processor, medians of warm runs, from the mesh in memory to the solution, without compilation: other work on
 # the machine changes them little. CalculiX is timed as a process, with its start and its reading of the input. The error is that of
 # P against quadratic elements of the size `--reference`, whose
-# P changes by 3e-5 on finer meshes, in 3D against Hertz, from whom the bodies' finite size departs by 0.3 %; the difference is that
-# of P against the united elements on the same mesh. A code that is not installed is left out, and named; one that fails at a size, or
+# P changes by 3e-5 on finer meshes, in 3D against Hertz, from whose solution the bodies' finite size differs by 0.3 %; the difference is
+# that of P against the united elements on the same mesh. A code that is not installed is left out, and named; one that fails at a size, or
 # takes more than `--timeout` seconds, is listed with the reason.
 
 # %%

@@ -23,7 +23,7 @@ Options:
 # 2. Two plates, one cell thick, that touch all over: bytes that a rank receives from others while all contactors are projected,
 #    against its share of the surfaces, its own contactors and facets. Nothing is timed: there may be more ranks than cores.
 # 3. The time of that search on one rank against the number of contactors.
-# 4. Collective calls of MPI in the second step of the first scene, by stage, whoever makes them: where ranks wait for each other.
+# 4. Collective calls of MPI in the second step of the first scene, by stage, in all libraries: where ranks wait for each other.
 #
 # Called on one rank the script starts `mpiexec` of itself for each number of ranks; on several, or with `--where here`, it measures on
 # those that it has. Numbers of a list are parted by commas.

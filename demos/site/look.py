@@ -70,7 +70,7 @@ def broken(folder: Path) -> list[str]:
 
 
 def run_notebook(path: Path) -> None:
-    """Run a notebook among the demos, as a reader would who has saved it there."""
+    """Run a notebook among the demos, as a reader would after saving it there."""
     notebook = nbformat.read(path, as_version=4)
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": DEMOS}}).execute()
 
