@@ -178,7 +178,7 @@ def check_state(problem: uem.UnitedProblem, scale: float, closed: float) -> None
 def obeyed(contact: uem.Contact) -> None:
     """Contactors of a soft contact press by the pressure of their gap, on one side of the surfaces alone (collective)."""
     pair = contact.pair
-    if pair.asked:
+    if pair.in_reach:
         if contact.normal.damping:
             p, slope = pair.pressures_at(pair.gaps())
         else:

@@ -1,4 +1,4 @@
-"""The one place that knows DOLFINx versions: 0.5 (Debian 12), 0.9 (Debian 13) and 0.11 (PyPI wheel, Debian sid).
+"""The only module that depends on DOLFINx versions: 0.5 (Debian 12), 0.9 (Debian 13) and 0.11 (PyPI wheel, Debian sid).
 
 The package, its demos and its tests call DOLFINx, UFL and Gmsh through these functions wherever versions differ.
 """

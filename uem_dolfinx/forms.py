@@ -213,7 +213,7 @@ def _of_sensible_degree(F: ufl.Form) -> ufl.Form:
     """The form with quadrature rules of at most ``DEGREES_ENOUGH`` times the degree for quotients, logarithms and similar terms.
 
     Integrands that are no polynomials are never integrated exactly. On quadrilaterals and hexahedra UFL estimates 12 points in every
-    direction for a neo-Hookean law at degree 1, and 22 at degree 2. 3 and 5 points have errors below 1e-6 at strains of 30 %.
+    direction for a neo-Hookean law at degree 1, and 22 at degree 2. Rules of 3 and 5 points have errors below 1e-6 at strains of 30 %.
     Hoop strains are quotients by a radius and are treated in the same way in all cells. Rules given in the measure are kept.
     """
     if not F.integrals():

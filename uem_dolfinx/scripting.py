@@ -227,7 +227,7 @@ def form(integrals: ufl.Form, jit_options: Mapping[str, Any] | None = None) -> A
 
     Returns:
         DOLFINx's compiled form, for ``integrate``, ``assemble_vector``, ``assemble_matrix`` and DOLFINx. Integrals with one-point rules
-        beside others are compiled apart: a list of two forms, which DOLFINx's own functions do not take.
+        are compiled separately from others: a list of two forms, which DOLFINx's own functions do not take.
 
     Raises:
         InputError, InputTypeError: for anything else than a form of integrals.

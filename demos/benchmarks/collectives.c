@@ -1,8 +1,8 @@
-/* Counts what a process hears and says by MPI, whoever makes the calls; collectives.py compiles it and has it loaded before MPI. */
+/* Counts the data that a process receives and sends by MPI, in all libraries; collectives.py compiles it and has it loaded before MPI. */
 #include <mpi.h>
 
 enum { CALLS, REDUCED, TOLD, ROWS, SENT, MESSAGES, KINDS };
-/* Collective calls; bytes that reductions and broadcasts bring, that every rank tells every other, of rows from others, of messages sent
+/* Collective calls; bytes that reductions and broadcasts bring, that every rank sends to every other, of rows from others, of messages sent
    to single ranks; number of messages to single ranks, those of rows too. */
 static long counts[KINDS];
 

@@ -17,12 +17,12 @@ import numpy as np
 from uem_dolfinx import log
 
 SOURCE = Path(__file__).with_suffix(".c")
-#: Where a process is told which library counts.
+#: Environment variable with the library that counts.
 LIBRARY = "UEM_COUNTS_COLLECTIVES"
 
 
 def environment(mpiexec: str, folder: Path) -> dict[str, str]:
-    """What makes processes of this ``mpiexec`` count; nothing where no compiler of the same MPI stands beside it."""
+    """Environment in which processes of this ``mpiexec`` count; empty without a compiler of the same MPI in its folder."""
     compiler = shutil.which("mpicc", path=str(Path(mpiexec).parent))
     if compiler is None:
         return {}
@@ -60,7 +60,7 @@ def traffic() -> Iterator[dict[str, np.ndarray]]:
         library.traffic(now)
         return np.array(now)
 
-    #: Stages that are open, and the counts up to which they have been told.
+    #: Stages that are open, and the counts up to which they have been reported.
     open_stages, before = ["other"], counts()
 
     def take() -> None:

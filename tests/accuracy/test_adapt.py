@@ -185,7 +185,7 @@ def test_sizes_change_by_a_bounded_factor():
 
 
 def test_shares_after_a_change():
-    """A tolerance asks for cells whose shares, which fall with h^(2p+d), sum up to it."""
+    """A tolerance is reached with cells whose shares, which fall with h^(2p+d), sum up to it."""
     shares = np.array([1.0, 2.0, 4.0])
     factors = size_factors(shares, 1, 2, COMM, 0.9 * shares.sum() * COMM.size, None)
     after = shares * factors**4

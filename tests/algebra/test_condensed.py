@@ -75,7 +75,7 @@ def test_solutions_are_those_of_the_whole(name, kind, apart, curved):
             solver.begin_at(c)
             rhs = -Q.transpose(forces + K * c + (0.0 * c if G is None else G * c))
             dq, solves = solver.solve(rhs, near=known)
-            asked = solver.forces(K, P.expand(dq) + c)
+            requested = solver.forces(K, P.expand(dq) + c)
             known, dq = dq, solver.complete(dq)
             p, q, b = gathered_matrix(P.P), gathered_matrix(Q.P), gathered_vector(rhs)
             used = np.abs(p).max(axis=0) > 0
@@ -89,7 +89,7 @@ def test_solutions_are_those_of_the_whole(name, kind, apart, curved):
             # forces that are known before I is solved for: right but for prescribed components
             exact = gathered_vector(K * (P.expand(dq) + c))
             free = gathered_vector(P.space.vector(P.free)) > 0
-            assert np.abs((gathered_vector(asked) - exact)[free]).max() <= EXACT * np.abs(exact).max() * np.linalg.cond(A)
+            assert np.abs((gathered_vector(requested) - exact)[free]).max() <= EXACT * np.abs(exact).max() * np.linalg.cond(A)
             assert solver.negative == (Q is not P and np.linalg.slogdet(A)[0] < 0)
             assert kind == "lu" or solver.indefinite == (np.linalg.eigvalsh(A)[0] < 0)
     # without anything that contact does, it is of the whole
@@ -169,9 +169,9 @@ def test_one_factorisation_of_linear_bodies():
 def test_feet_that_move_to_the_next_facets(wide, factorisations):
     """They find its nodes among those that are left out of the factorisation from the start."""
     _, contact, problem = pressed(way=0.04)
-    assert problem.system.solver.condensed.beside is not None
+    assert problem.system.solver.condensed.adjacent_nodes is not None
     if not wide:
-        problem.system.solver.condensed.beside = None
+        problem.system.solver.condensed.adjacent_nodes = None
     before = contact.pair.kinematics.projection.facet
     with counted() as calls:
         problem.solve()

@@ -164,7 +164,7 @@ def test_a_dependent_row_takes_no_other_along(seed, near, scale):
 
 @pytest.mark.parametrize("part, depends", [(5e-7, True), (2e-6, False)])
 def test_rows_that_depend_nearly(part, depends):
-    """What a row has across the others tells whether it depends on them, not what it has of its own node."""
+    """The part of a row across the others determines whether it depends on them, not its entry at its own node."""
     rng = np.random.default_rng(0)
     A, free = rows(rng, 4, np.ones(4))
     free[:] = True

@@ -155,17 +155,17 @@ def test_places_of_earlier_products(comm):
     assert handles[1] == handles[2] != handles[3]
 
 
-@pytest.mark.parametrize("asked, given", [(3e-10, True), (3e-11, False)])
-def test_accuracy_of_an_iterative_solve(asked, given):
-    """A Newton iteration gets the accuracy that it asks for, unless it is near rounding."""
+@pytest.mark.parametrize("requested, given", [(3e-10, True), (3e-11, False)])
+def test_accuracy_of_an_iterative_solve(requested, given):
+    """A Newton iteration gets the accuracy that it requires, unless it is near rounding."""
     config = triangles(1)
     solver, K = UnitedSolver(config, "thresholds_", ITERATIVE), mass(config)
     solver.set_operator(united(config, []), K, None)
     rhs = K.createVecLeft()
     rhs.set(1.0)
-    solver.solve(rhs, accuracy=asked)
+    solver.solve(rhs, accuracy=requested)
     rtol = solver.ksp.getTolerances()[0]
-    assert rtol == asked if given else rtol > 1.5 * asked
+    assert rtol == requested if given else rtol > 1.5 * requested
 
 
 def test_an_unsymmetric_solve_is_as_accurate_as_wanted(comm):

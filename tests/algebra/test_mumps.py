@@ -37,7 +37,7 @@ def pressed(comm, options, friction=0.0):
 @pytest.mark.parametrize("kind, friction", [("cholesky", 0.0), ("lu", 0.0), ("lu", 0.02)])
 @pytest.mark.slow
 def test_mumps_gets_the_workspace_it_asks_for(comm, kind, friction, caplog):
-    """With too little workspace at first the state is that of a run with enough; with friction the sign of the determinant is told."""
+    """With too little workspace at first the state is that of a run with enough; with friction the sign of the determinant is reported."""
     states = []
     for workspace in ({}, TOO_LITTLE):
         caplog.clear()
@@ -53,7 +53,7 @@ def test_mumps_gets_the_workspace_it_asks_for(comm, kind, friction, caplog):
 
 @pytest.mark.parametrize("workspace, gets", [(900, {"mat_mumps_icntl_14": 1900}), (1000, {})])
 def test_workspace_has_an_end(comm, workspace, gets, monkeypatch):
-    """A factorisation that lacked workspace gets twice as much as it had, up to the most; then the error tells what MUMPS says."""
+    """A factorisation that lacked workspace gets twice as much as it had, up to the most; then the error contains the message of MUMPS."""
     _, problem = pressed(comm, {"pc_type": "cholesky"} | TOO_LITTLE)
     with monkeypatch.context() as m:
         m.setattr(mumps, "MOST_WORKSPACE", -100)

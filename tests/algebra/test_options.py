@@ -37,7 +37,7 @@ def test_factorised_at_need(size, gdim, at_need):
 
 
 def test_no_options_are_the_default_ones():
-    """No option asks for no more than None does, but where PETSc's database has some for the prefix."""
+    """Empty options mean the same as None, except where PETSc's database has some for the prefix."""
     assert options_in_turn({}, "empty_", 40_000, 3, False) == options_in_turn(None, "empty_", 40_000, 3, False)
     PETSc.Options()["empty_ksp_type"] = "gmres"
     try:
@@ -50,17 +50,17 @@ def test_no_options_are_the_default_ones():
 @pytest.mark.parametrize("kind", ["lu", "cholesky"])
 def test_a_factorisation_without_a_package_is_made_by_mumps(kind, caplog):
     """Said once, and not where a package is named, here or in PETSc's database, or where it is no factorisation."""
-    package, asked = "pc_factor_mat_solver_type", {"ksp_type": "preonly", "pc_type": kind}
+    package, requested = "pc_factor_mat_solver_type", {"ksp_type": "preonly", "pc_type": kind}
     with caplog.at_level("INFO"):
-        assert options_in_turn(asked, "package_", 100, 3, False)[0] == asked | {package: "mumps"}
+        assert options_in_turn(requested, "package_", 100, 3, False)[0] == requested | {package: "mumps"}
     # messages are those of one rank
     assert ("MUMPS" in caplog.text) == (MPI.COMM_WORLD.rank == 0)
     caplog.clear()
-    own = asked | {package: "petsc"}
+    own = requested | {package: "petsc"}
     assert options_in_turn(own, "package_", 100, 3, False)[0] == own
     PETSc.Options()[f"package_{package}"] = "petsc"
     try:
-        assert options_in_turn(asked, "package_", 100, 3, False)[0] == asked
+        assert options_in_turn(requested, "package_", 100, 3, False)[0] == requested
     finally:
         del PETSc.Options()[f"package_{package}"]
     assert package not in options_in_turn({"pc_type": "gamg"}, "package_", 100, 3, False)[0] and not caplog.text

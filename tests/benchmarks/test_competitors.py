@@ -223,7 +223,7 @@ def test_rigid_target(method, parameter):
 
 
 def test_names_and_parameters():
-    """A method that is not there, or a parameter too many or too few, is told."""
+    """A method that is not there, or a parameter too many or too few, is reported."""
     b = blocks(COMM, "triangle")
     for method, parameter in (("glue", None), ("penalty", None), ("united", 1.0)):
         with pytest.raises(ValueError, match="expected one of|parameter"):

@@ -99,7 +99,7 @@ def test_preconditioner_is_kept():
     with counted() as calls:
         history = problem.solve()
     assert 1 <= calls[FACTORISATION] < len(history) - 1
-    # who touches first follows from how the bodies would move rigidly
+    # the first contactor follows from how the bodies would move rigidly
     assert history[0].exchanges == 0 and history[0].active > 0
 
 

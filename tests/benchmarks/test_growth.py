@@ -27,8 +27,8 @@ def test_model_finds_its_terms(parts):
     model = growth.fitted(rows, "row_bytes")
     assert model.pop("error") < 1e-6
     assert {name: value for name, value in model.items() if value > 1e-6 * max(parts.values())} == pytest.approx(parts)
-    told = growth.on_paper(model, 1e8, 1000)
-    assert sum(told.values()) == pytest.approx(sum(growth.on_paper(parts, 1e8, 1000).values()))
+    reported = growth.on_paper(model, 1e8, 1000)
+    assert sum(reported.values()) == pytest.approx(sum(growth.on_paper(parts, 1e8, 1000).values()))
 
 
 def test_too_few_counts_make_no_model():

@@ -256,7 +256,7 @@ def test_a_second_problem_on_a_mesh(comm, monkeypatch):
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_facets_are_placed_once_where_they_are(comm, cell, monkeypatch):
-    """Normals of a target that has not moved since are those that it had, whatever asks for them; after a motion they are others."""
+    """Normals of a target that has not moved since are those that it had, whichever function uses them; after a motion they are others."""
     b = blocks(comm, cell)
     problem = uem.UnitedProblem(linear(b.u, 1000.0), b.u, bcs=b.oedometer(0.05), contacts=[uem.Contact(b.high, b.low)])
     target, points = problem.contacts[0].pair.target, problem.contacts[0].pair.points
@@ -366,8 +366,8 @@ def test_scene_without_gmsh_matplotlib_pyvista():
     """A scene that needs none of them runs where all are missing; what does need one says which."""
     optional = ["gmsh", "matplotlib", "pyvista", "vtk", "tqdm"]
     assert python(SCENE.format(missing=optional, then="print('done')")).split() == ["done"]
-    told = python(SCENE.format(missing=optional, then=DRAWS))
-    assert told.startswith("MissingBackendError") and "matplotlib" in told
+    reported = python(SCENE.format(missing=optional, then=DRAWS))
+    assert reported.startswith("MissingBackendError") and "matplotlib" in reported
 
 
 @serial

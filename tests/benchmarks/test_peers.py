@@ -76,7 +76,7 @@ def test_arrays_hold_the_whole_mesh(comm, bodies):
     mesh, _, scene = bodies
     sizes = [mesh.topology.index_map(dim).size_global for dim in (0, 2)]
 
-    def told():
+    def reported():
         area, x = areas(scene.x, scene.cells), scene.x
         middle = x[scene.cells].mean(axis=1)
         return {
@@ -91,7 +91,7 @@ def test_arrays_hold_the_whole_mesh(comm, bodies):
             "sides": all(len(scene.sides(name)) == len(edges) for name, edges in scene.facets.items()),
         }
 
-    t = first(comm, told)
+    t = first(comm, reported)
     assert t["sizes"] == sizes and t["all used"] and t["sides"] and t["least area"] > 0
     assert t["block"] == pytest.approx(36.0) and t["disc"] == pytest.approx(np.pi * 9 / 4, rel=5e-3)
     assert t["disc above"][0] > 0 > t["disc above"][1] and t["arc"] < 1e-9
@@ -113,7 +113,7 @@ def test_calculix_input_keeps_everything(comm, bodies, folder):
     """Read back: all nodes to 12 digits, all cells, counterclockwise, and the sides of both contact surfaces."""
     _, _, scene = bodies
 
-    def told():
+    def reported():
         by_calculix.write(folder / "hertz.inp", scene, 1e8, 1e-8)
         data = dict(blocks_of(folder / "hertz.inp"))
         nodes = np.array(data["*NODE,NSET=all"], dtype=float)
@@ -133,7 +133,7 @@ def test_calculix_input_keeps_everything(comm, bodies, folder):
             "widest": max(len(field) for _, rows in data.items() for row in rows for field in row),
         }
 
-    t = first(comm, told)
+    t = first(comm, reported)
     assert t["numbers"] == [True, True] and t["nodes"] < 1e-11 and t["cells"] and t["least area"] > 0
     assert t["surfaces"] == {"disc_arc": True, "block_top": True} and t["held"]
     # the width of CalculiX's fields
@@ -200,7 +200,7 @@ def script(folder, monkeypatch, *options):
 
 
 @pytest.mark.slow
-def test_script_tells_who_is_absent_and_who_fails(folder, monkeypatch):
+def test_script_names_absent_codes_and_failures(folder, monkeypatch):
     """Codes that are not there are named with the way to install them, those that fail with the reason, and the rest runs."""
 
     def fail(*arguments):

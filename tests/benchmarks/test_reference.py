@@ -85,14 +85,14 @@ def test_an_elliptic_contact():
 
 
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="it starts a process of its own")
-@pytest.mark.parametrize("told, count", [(" iteration 1\n\n iteration 2\n", 2), ("linear\n", 1), ("*ERROR reading\n", None)])
-def test_iterations_of_calculix(tmp_path, monkeypatch, told, count):
+@pytest.mark.parametrize("reported, count", [(" iteration 1\n\n iteration 2\n", 2), ("linear\n", 1), ("*ERROR reading\n", None)])
+def test_iterations_of_calculix(tmp_path, monkeypatch, reported, count):
     """As many as it prints, one of a linear deck, none of a deck that it does not take or without the program."""
     ccx, deck = tmp_path / "ccx", tmp_path / "deck.inp"
     deck.write_text("*HEADING\n", encoding="utf-8")
     monkeypatch.setenv("PATH", "/nowhere")
     assert compare.of_calculix(deck) is None
-    ccx.write_text(f"#!/bin/sh\nprintf '%s' '{told}'\n", encoding="utf-8")
+    ccx.write_text(f"#!/bin/sh\nprintf '%s' '{reported}'\n", encoding="utf-8")
     ccx.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     assert compare.of_calculix(deck) == count

@@ -151,7 +151,7 @@ def point(problem, method, seconds, error, parameter=None, dofs=100):
     }  # fmt: skip
 
 
-def test_table_tells_who_is_first():
+def test_table_names_the_first():
     some = [
         point("a", "united", 2.0, 5e-3), point("a", "united", 3.0, 5e-4, dofs=400), point("a", "penalty", 1.0, 9e-3, 10.0),
         point("a", "penalty", 0.5, 2e-2, 1.0), point("a", "broken", None, None),

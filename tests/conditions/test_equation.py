@@ -32,7 +32,7 @@ from helpers import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from restart_scenes import goes_on_alike
+from restart_scenes import continues_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -134,7 +134,7 @@ def test_values_between_steps():
     assert c.value(2, 0.5, 1) == pytest.approx(-0.02, rel=1e-13) and first.factor == 0.5
 
 
-def test_goes_on_from_a_checkpoint(folder):
+def test_continues_from_a_checkpoint(folder):
     """Load steps that go on from a file end where those of one run do, to the last bit; without the equations they are refused."""
     ends = []
     for stop in (3, 1, 3):
@@ -146,7 +146,7 @@ def test_goes_on_from_a_checkpoint(folder):
             if step.number == stop + 1 and stop < 3:
                 break
         ends.append(np.array(c.u.x.array))
-    goes_on_alike(ends[2], ends[0])
+    continues_alike(ends[2], ends[0])
     assert not np.array_equal(ends[1], ends[0])
     c = Cell()
     problem = c.problem(bcs=clamp(c.V, c.left), law=st_venant)

@@ -181,7 +181,7 @@ def test_an_edge_that_is_led_in_time(mass):
     np.testing.assert_allclose(*found, rtol=1e-11)
 
 
-def test_a_run_goes_on(folder):
+def test_a_run_continues(folder):
     """A checkpoint holds no values: the second run takes them from the same functions."""
     found = []
     for end in (2, 4):

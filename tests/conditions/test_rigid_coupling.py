@@ -291,7 +291,7 @@ def test_rigid_bodies_on_each_other():
 
 @pytest.mark.parametrize(("part", "height", "pressed"), [(0.99, 1.0, True), slow(0.99, 1.0, False), (1.2, 0.1, False)])
 def test_what_friction_cannot_hold(part, height, pressed):
-    """A rigid block on a soft base, pushed by so much of what friction bears: told so, as of an elastic one, pressed on before or not.
+    """A rigid block on a soft base, pushed by parts of the friction limit: the error is that of an elastic one, pressed on before or not.
 
     At 0.99 pushed at its top the rear of the block digs into the base, whose slope takes a part of its weight.
     """

@@ -1,4 +1,4 @@
-"""The active set as pure functions of arrays: who enters, who is released, in which order; no mesh, no ranks.
+"""The active set as pure functions of arrays: contactors that enter and are released, and their order; no mesh, no ranks.
 
 Read first: ``test_exchange_is_complementarity`` and ``test_linear_complementarity_is_solved``.
 """
@@ -132,7 +132,7 @@ def test_murty_s_circle():
     assert np.allclose(lam, 1 / 3) and number < 20
 
 
-def test_when_the_first_goes_alone():
+def test_when_only_the_first_is_released():
     """All at once while there are fewer wrong than ever before, and thirty times more; then the first alone until there are fewer."""
     pivoting, new = active_set.Pivoting(), iter(range(99))
     counts, alone = (9, 5, 5, 7, 6, *[8] * 27, 5, 8, 4, 4), [32, 33]

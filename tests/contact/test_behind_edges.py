@@ -98,8 +98,8 @@ def test_gaps_of_contactors_behind_edges(cell, sliding, scale):
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0])
-@pytest.mark.parametrize(("slope", "goes_on"), [(0.03, True), (0.2, True), (0.3, False), (2.0, False)])
-def test_shallow_edges(slope, goes_on, scale):
+@pytest.mark.parametrize(("slope", "continues"), [(0.03, True), (0.2, True), (0.3, False), (2.0, False)])
+def test_shallow_edges(slope, continues, scale):
     """A node straight below the bottom of a V is off its facets by slope times its depth; facets of sharp ones end at the bottom."""
     low, high = box("triangle", [-1.0, -1.0], [1.0, 0.0], [2, 1]), box("triangle", [-0.1, -0.02], [0.1, 0.3], [2, 1])
     s = scene(COMM, "triangle", [low, high], pose=lambda x: scale * (x + np.column_stack([0 * x[:, 0], slope * np.abs(x[:, 0])])))
@@ -111,4 +111,4 @@ def test_shallow_edges(slope, goes_on, scale):
     bottom = np.abs(pair.config.X[pair.nodes, 0]) < 1e-3 * scale
     weights = pair.kinematics.projection.weights[bottom]
     assert COMM.allreduce(len(weights)) == 1
-    assert COMM.allreduce(int(((weights < -1e-6) | (weights > 1 + 1e-6)).any())) == goes_on
+    assert COMM.allreduce(int(((weights < -1e-6) | (weights > 1 + 1e-6)).any())) == continues

@@ -243,7 +243,7 @@ def test_a_fibre_is_pulled_out(coupling):
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("unloading", ["origin", "plastic"])
-def test_a_run_that_goes_on(folder, unloading, friction):
+def test_a_run_that_continues(folder, unloading, friction):
     """From a checkpoint a run goes on as if it had not ended, with its damage; another law is named."""
     law = uem.Cohesive(1.0, 0.01, unloading=unloading)
 
@@ -322,7 +322,7 @@ def test_what_is_refused():
 
 
 def test_damage_in_result_files(folder):
-    """Result files have the damage, the shear and tensile pressures of a bond, as the contact tells them."""
+    """Result files have the damage, the shear and tensile pressures of a bond, as the contact has them."""
     b = blocks(COMM, "quadrilateral", 2, 3)
     contact = uem.Contact(b.high, b.low, cohesion=BOND)
     problem = pulled(b, lambda s: np.array([0.002, 0.01]) * s, [contact])

@@ -190,7 +190,7 @@ def test_which_edges_are_pointed(slope, expected):
 
 
 @pytest.mark.parametrize("part, expected", [(0.02, 1), (0.2, 0)])
-def test_who_is_left_out(part, expected):
+def test_edges_without_corner_contact(part, expected):
     """A contactor near a corner, at a part of its facet, is left to the equation of the corner; one farther away has its own."""
     n = 8
     h = 1.0 / n
@@ -217,7 +217,7 @@ def test_friction_and_offset_between_steps():
     assert abs(contact.resultant().force).max() == 0.0
 
 
-def test_a_run_goes_on(folder):
+def test_a_run_continues(folder):
     """From a checkpoint in touch, as one that was not interrupted."""
     scenes = [punch(n=8, friction=0.2, corners=True) for _ in range(2)]
     (whole, one, move), (again, other, again_move) = (s for s, _ in scenes)

@@ -13,7 +13,7 @@ import ufl
 from benchmarks.scenes import box
 from block_scenes import st_venant
 from dolfinx import fem
-from edge_scenes import COMM, E, crossed, goes_on_from_checkpoints, rod, rods, roofs, turned
+from edge_scenes import COMM, E, continues_from_checkpoints, crossed, rod, rods, roofs, turned
 from helpers import coulomb, factors, gathered_matrix, highest, refused, run, slow
 from petsc4py import PETSc
 
@@ -224,7 +224,7 @@ def test_checkpoints(friction, folder):
         how = {"length": 12.0, "angle": 1.0, "along": (0.7, 1.3), "law": st_venant, "friction": friction, "way": (0.4, 0.2, -0.5)}
         return rods((11, 12), on_edge=False, **how)
 
-    goes_on_from_checkpoints(begun, folder)
+    continues_from_checkpoints(begun, folder)
 
 
 def test_refused():

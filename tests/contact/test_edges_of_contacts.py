@@ -10,7 +10,7 @@ import pytest
 from benchmarks.scenes import box
 from block_scenes import st_venant
 from body_scenes import fork, skin_of
-from edge_scenes import COMM, crossed, folded, goes_on_from_checkpoints, rods, roofs, turned
+from edge_scenes import COMM, continues_from_checkpoints, crossed, folded, rods, roofs, turned
 from helpers import at, coulomb, refused, run, slow
 
 import uem_dolfinx as uem
@@ -159,7 +159,7 @@ def test_checkpoints(friction, folder):
     def begun():
         return rods((11, 12), on_edge=False, friction=friction, surfaces=OUTSIDE, edges=True, corners=True, **OBLIQUE)
 
-    goes_on_from_checkpoints(begun, folder)
+    continues_from_checkpoints(begun, folder)
 
 
 @pytest.mark.parametrize("how", [{"sliding": "small"}, {"tied": True}, {"friction": uem.Tresca(1.0)}])

@@ -79,7 +79,7 @@ def test_sliding_off():
 
 
 @pytest.mark.parametrize("size, gap, near", [(1.0, 0.9, True), (1.0, 1.1, False), (np.inf, 0.19, True), (np.inf, 0.21, False)])
-def test_who_is_near(size, gap, near):
+def test_near_contactors(size, gap, near):
     """Within a facet of the target, or within the reach of a rigid one, which has none; active ones in any case."""
     found = Ends(SimpleNamespace(gap=np.array([gap]), way_beyond=np.zeros(1), facet_size=np.array([size])), np.inf)
     assert found.near(remembered(), 0.2)[0] == near and found.near(remembered(active=True), 0.2)[0]

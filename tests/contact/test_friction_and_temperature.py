@@ -13,7 +13,7 @@ import ufl
 from dolfinx import fem
 from field_scenes import fields, strain, stress
 from helpers import blocks, highest, linear, refused, slow
-from restart_scenes import goes_on_alike
+from restart_scenes import continues_alike
 
 import uem_dolfinx as uem
 
@@ -151,8 +151,8 @@ def test_going_on_from_a_checkpoint(folder):
             break
     assert len(last.run(checkpoint=uem.Checkpoint(folder / "run", every=1))) == 2
     for own, alone in zip(last.f.w.split(), whole.f.w.split()):
-        goes_on_alike(own.collapse().x.array, alone.collapse().x.array)
-    goes_on_alike(last.contact.slip.x.array, whole.contact.slip.x.array)
+        continues_alike(own.collapse().x.array, alone.collapse().x.array)
+    continues_alike(last.contact.slip.x.array, whole.contact.slip.x.array)
 
 
 def test_what_is_refused():

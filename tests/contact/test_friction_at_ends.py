@@ -57,7 +57,7 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     assert stick.any() and pair.friction.slipping(state).any() and problem.system._rows().frictionless.fades
     made, placed, free = pair.equations(), pair.kinematics, problem.bodies.free[:size].ravel()
     kept = made.rows.active
-    rows, who, normal = rows_of(made.rows.select(kept), size)[:, free], made.contactor[kept], made.tangent[kept] < 0
+    rows, node, normal = rows_of(made.rows.select(kept), size)[:, free], made.contactor[kept], made.tangent[kept] < 0
     # no motion that is left opens a gap or moves what sticks
     P = gathered_matrix(problem.system._rows().frictionless.P)[free]
     assert np.abs(rows @ P).max() <= 1e-13 and np.linalg.matrix_rank(P) == free.sum() - len(rows)
@@ -68,8 +68,8 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     found, *_ = np.linalg.lstsq(rows.T, F, rcond=None)
     assert np.linalg.norm(rows.T @ found - F) <= 1e-10 * np.linalg.norm(F)
     largest, lam, tau = state.lam.max(), np.zeros_like(state.lam), np.zeros_like(state.force)
-    lam[who[normal]] = found[normal] * placed.pressure_map(False).force[who[normal]]
-    np.add.at(tau, who[~normal], found[~normal, None] * made.rows.select(kept).direction[~normal])
+    lam[node[normal]] = found[normal] * placed.pressure_map(False).force[node[normal]]
+    np.add.at(tau, node[~normal], found[~normal, None] * made.rows.select(kept).direction[~normal])
     assert np.abs(lam - state.lam).max() <= 1e-7 * largest
     assert np.abs(tau * share[:, None] - state.friction.tau)[stick].max() <= 1e-7 * largest
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from dolfinx import fem, mesh
 from helpers import at, box, linear, raised, scene, slow
-from restart_scenes import goes_on_alike
+from restart_scenes import continues_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -163,7 +163,7 @@ def test_which_functions_follow_the_load():
     )
 
 
-def test_friction_that_follows_the_load_goes_on_from_a_checkpoint(folder):
+def test_friction_that_follows_the_load_continues_from_a_checkpoint(folder):
     """Where it begins with zero, too: what slips goes on slipping."""
 
     def friction(x, t):
@@ -176,8 +176,8 @@ def test_friction_that_follows_the_load_goes_on_from_a_checkpoint(folder):
             break
     found = last.run(checkpoint=uem.Checkpoint(folder / "run", every=1))
     assert len(found) == 2
-    goes_on_alike(last.u.x.array, whole.u.x.array)
-    goes_on_alike(last.contact.slip.x.array, whole.contact.slip.x.array)
+    continues_alike(last.u.x.array, whole.u.x.array)
+    continues_alike(last.contact.slip.x.array, whole.contact.slip.x.array)
 
 
 def test_a_step_that_is_taken_again_has_its_friction():

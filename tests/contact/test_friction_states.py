@@ -1,4 +1,4 @@
-"""Who sticks, who slips and where to: pure functions, without a mesh."""
+"""Contactors that stick, and that slip, and their directions: pure functions, without a mesh."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def test_tangents_in_free_components():
 
 
 def test_stick_and_slip():
-    """Who sticks slides out of the cone; who slips sticks when the slip turns back; who is let go of does neither."""
+    """Sticking contactors slip outside the cone; slipping ones stick when the slip is reversed; released ones do neither."""
     s = state([True, True, False, False, True], [[0, 0], [0, 0], [1, 0], [1, 0], [0, 0]])
     tau = np.array([[0.2, 0.0], [-0.4, 0.0], [-0.3, 0.0], [-0.3, 0.0], [1.0, 0.0]])
     slip = np.array([[0.0, 0], [0, 0], [0.1, 0], [-0.1, 0], [0, 0]])
@@ -83,7 +83,7 @@ def test_springs_that_are_dragged(way, bound, stick, back):
     assert np.abs(-tau[:, 0] - np.clip(way, -bound, bound)).max() <= 2e-12
 
 
-def test_who_comes_sticks_and_who_goes_forgets():
+def test_new_contactors_stick_and_released_ones_forget():
     s = state([True, False, False], [[0, 0], [0, 1], [0, 0]])
     before, now = np.array([True, True, False]), np.array([False, True, True])
     after = stick_slip.come_and_go(s, before, now, np.array([True, True, True]))

@@ -121,15 +121,15 @@ GRIDS = [
 
 def pressures_by_axis(contact, g):
     """Pressures along each axis of nodes that touch along it, the sum over the bodies that a node touches so, and the axes (collective)."""
-    told = []
+    reported = []
     for part in contact.parts:
         pair = part.pair
         on, pressures = pair.trial.active, part.pressures
         axis = np.abs(pair.kinematics.projection.normal[on]).argmax(axis=1)
-        told.append(np.column_stack([pair.config.to_global(pair.nodes[on]) * g + axis, pressures[on]]))
-    told = np.concatenate(COMM.allgather(np.concatenate(told)))
-    key, which = np.unique(told[:, 0], return_inverse=True)
-    return key % g, np.bincount(which, told[:, 1])
+        reported.append(np.column_stack([pair.config.to_global(pair.nodes[on]) * g + axis, pressures[on]]))
+    reported = np.concatenate(COMM.allgather(np.concatenate(reported)))
+    key, which = np.unique(reported[:, 0], return_inverse=True)
+    return key % g, np.bincount(which, reported[:, 1])
 
 
 @pytest.mark.parametrize("cell,counts,n", GRIDS, ids=str)
@@ -317,7 +317,7 @@ def reference(request):
 
 @pytest.mark.parametrize("order", [(2, 0, 1), (1, 2, 0), (2, 1, 0)])
 def test_order_of_input(reference, order):
-    """The finer follows, whoever comes first."""
+    """The finer body is the contactor, in both orders."""
     same(heap(order, mu=reference[0]), reference[1])
 
 

@@ -1,4 +1,4 @@
-"""General contact: who may touch whom, results of bodies that touch, runs in steps, and what is refused.
+"""General contact: pairs that may touch, results of bodies that touch, runs in steps, and what is refused.
 
 Two tests to read first: ``test_forces_and_moments_balance`` and ``test_going_on_from_a_checkpoint``.
 """
@@ -22,7 +22,7 @@ from uem_dolfinx import forms
 COMM = MPI.COMM_WORLD
 
 
-# -- who may touch whom ------------------------------------------------------------------------------------------------------
+# -- pairs that may touch --------------------------------------------------------------------------------------------------
 
 
 def pressed(contacts, cell="quadrilateral", steps=1, n=(2, 4), **how):
@@ -148,7 +148,7 @@ def test_rigid_surfaces(cell, mu):
     ) == (mu > 0.0)
 
 
-# -- what is told ------------------------------------------------------------------------------------------------------------
+# -- results -----------------------------------------------------------------------------------------------------------------
 
 
 #: Of three discs of 12 sides and the radius 0.5, a little inside each other.
@@ -183,9 +183,9 @@ def test_forces_and_moments_balance(mu):
             nodal = COMM.allreduce(
                 np.append(force[mine].sum(axis=0), (arm[:, 0] * force[mine, 1] - arm[:, 1] * force[mine, 0]).sum())
             )
-            told = np.append(every.force, every.moment)
-            assert np.abs(told - sum(np.append(p.force, p.moment) for p in parts)).max() < 1e-15
-            assert np.abs(told - nodal).max() < 1e-14
+            reported = np.append(every.force, every.moment)
+            assert np.abs(reported - sum(np.append(p.force, p.moment) for p in parts)).max() < 1e-15
+            assert np.abs(reported - nodal).max() < 1e-14
 
 
 def test_written_as_one(folder):
@@ -209,8 +209,8 @@ def test_pairs_in_a_table(folder):
     pairs = contact.forces_of_pairs()
     assert [(t.first, t.second) for t, _ in pairs] == [("base, below", "body 2")]
     for (first, second, _, force), moment in pairs:
-        told = contact.between(first, second)
-        assert np.array_equal(told.force, force) and np.array_equal(told.moment, moment) and np.abs(moment).max() > 0
+        reported = contact.between(first, second)
+        assert np.array_equal(reported.force, force) and np.array_equal(reported.moment, moment) and np.abs(moment).max() > 0
     for resume in (False, True, False):
         with uem.HistoryWriter(folder / "run.csv", problem, resume=resume) as writer:
             writer.write(1.0)

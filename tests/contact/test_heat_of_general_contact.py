@@ -23,7 +23,7 @@ class Bars:
     """Guided blocks of the same meshes, cold at the bottom and hot at the top, whose upper one is pressed down.
 
     Args:
-        contacts: tells them of the blocks.
+        contacts: makes the contacts of the blocks.
         wall: whether a wall is in place of what presses and heats the top.
     """
 
@@ -96,11 +96,11 @@ def test_what_touches_nothing_is_not_searched(monkeypatch):
     """Of the lists of a general contact those with nothing on them look for nothing that is opposite."""
     from uem_dolfinx.contact.thermal import heat
 
-    asked = []
-    monkeypatch.setattr(heat, "sides_of", lambda pair, of=heat.sides_of: (asked.append(pair), of(pair))[1])
+    requested = []
+    monkeypatch.setattr(heat, "sides_of", lambda pair, of=heat.sides_of: (requested.append(pair), of(pair))[1])
     bars = Bars(lambda b: [uem.GeneralContact(heat=uem.Conductance(5.0, field=1))])
     first, *others = bars.contacts[0].parts
-    assert {id(pair) for pair in asked} == {id(first.pair)} and len(others) == 2
+    assert {id(pair) for pair in requested} == {id(first.pair)} and len(others) == 2
 
 
 def test_what_is_refused():

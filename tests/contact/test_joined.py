@@ -31,8 +31,8 @@ def one_by_one(monkeypatch):
     monkeypatch.setattr(joining, "_kind", lambda *of: None)
 
 
-def told(contact):
-    """What a contact tells of itself, by nodes, and in sums over all ranks."""
+def reported(contact):
+    """Results of a contact, by nodes, and in sums over all ranks."""
     fields = [getattr(contact, name) for name in ("pressure", "gap", "active", "status", "traction", "slip", "force")]
     on = [contact.resultant(on=side) for side in ("contactor", "target")]
     sums = [contact.n_active, contact.max_gap(), contact.max_pressure(), contact.initial_overlap, contact.dissipation]
@@ -75,7 +75,7 @@ def blocks_in_a_grid(cell, counts, mu, settlement, normals="facet"):
     ],
 )  # fmt: skip
 def test_blocks_in_a_grid(cell, counts, mu, normals, monkeypatch):
-    """All iterations but for rounding, displacements, and what each contact tells are as if it were treated alone; nodes are of several."""
+    """All iterations but for rounding, displacements, and results of each contact are as if it were treated alone; nodes are of several."""
     found = []
     for together in (True, False):
         if not together:
@@ -83,7 +83,7 @@ def test_blocks_in_a_grid(cell, counts, mu, normals, monkeypatch):
         contacts, problem = blocks_in_a_grid(cell, counts, mu, 0.02, normals)
         assert all(isinstance(contact.pair, Member) is together for contact in contacts) and len(contacts) > 1
         steps = [len(problem.solve()) for _ in range(2)]
-        found.append((problem.u, steps, [told(contact) for contact in contacts]))
+        found.append((problem.u, steps, [reported(contact) for contact in contacts]))
     (u, n, here), (v, m, there) = found
     assert all(abs(a - b) <= 1 for a, b in zip(n, m))
     close(u, v)
@@ -101,7 +101,7 @@ def test_discs_in_motion(mu, monkeypatch):
         contacts = d.contacts(False)
         problem = d.problem(contacts)
         steps = [(s.newton_iterations, [c.n_active for c in contacts]) for s in uem.time_steps(problem, 0.02, 0.14)]
-        found.append((problem.u, steps, [told(contact) for contact in contacts], [contact.pair.far for contact in contacts]))
+        found.append((problem.u, steps, [reported(contact) for contact in contacts], [contact.pair.far for contact in contacts]))
     (u, one, here, far), (v, other, there, apart) = found
     assert [active for _, active in one] == [active for _, active in other] and far == apart
     assert all(abs(a - b) <= 1 for (a, _), (b, _) in zip(one, other)) and max(sum(active) for _, active in one) >= 1
@@ -129,7 +129,7 @@ def stacks(n, gap=0.0, mu=0.0, **how):
 
 
 def calls_of_a_step(n, monkeypatch):
-    # which asks every contact
+    # which calls every contact
     monkeypatch.setattr("conftest.check_state", lambda *a: None)
     contacts, problem = stacks(n, mu=0.2)
     problem.solve()
@@ -173,7 +173,7 @@ def test_friction_and_offsets_of_one(limit, monkeypatch):
         contacts[2].offset = 1e-3
         contacts[0].friction = 0.05
         steps = len(problem.solve())
-        found.append((problem.u, steps, [told(contact) for contact in contacts]))
+        found.append((problem.u, steps, [reported(contact) for contact in contacts]))
         forces = [contact.resultant().force for contact in contacts]
         # slopes of 0.05 and 0.1, and more pressure by the offset
         slopes = [abs(f[0] / f[1]) for f in forces]
@@ -188,7 +188,7 @@ def test_friction_and_offsets_of_one(limit, monkeypatch):
 
 
 def test_a_message_names_the_contact(caplog):
-    """An overlap at the start that is refused, and one that is told, is that of one contact."""
+    """An overlap at the start that is refused, and one that is reported, is that of one contact."""
     with pytest.raises(uem.PenetrationError, match="stack 1"):
         contacts, problem = stacks(2, gap=-0.05, max_penetration=0.06)
         contacts, problem = stacks(2, gap=-0.05, max_penetration=0.06)
@@ -271,7 +271,7 @@ def test_derivatives_of_a_pressure(monkeypatch):
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.3])
-def test_a_run_goes_on(mu, folder, monkeypatch):
+def test_a_run_continues(mu, folder, monkeypatch):
     """A run that goes on from the checkpoint of contacts that were treated alone is that of one in one go."""
     with monkeypatch.context() as change:
         one_by_one(change)
@@ -289,7 +289,7 @@ def test_a_run_goes_on(mu, folder, monkeypatch):
     assert len(again.solve()) == len(problem.solve())
     close(again.u, problem.u)
     for contact, other in zip(again.contacts, contacts):
-        alike(told(contact), told(other))
+        alike(reported(contact), reported(other))
 
 
 def test_steps_that_switch_one(monkeypatch):
@@ -395,7 +395,7 @@ def test_rigid_surfaces_that_move(mu, folder, monkeypatch):
         assert len(problem.interfaces) == (1 if together else 3)
         steps = [s.newton_iterations for s in uem.load_steps(problem, 2)]
         uem.write_checkpoint(folder / f"walls {together}", problem.state())
-        here = [told(contact) for contact in contacts]
+        here = [reported(contact) for contact in contacts]
         assert all(contact.n_active > 0 for contact in contacts)
         found.append((problem.u, steps, here))
     (u, n, here), (v, m, there) = found
@@ -407,7 +407,7 @@ def test_rigid_surfaces_that_move(mu, folder, monkeypatch):
     contacts, problem = between_walls(mu)
     uem.read_checkpoint(folder / "walls False", problem.state())
     for contact, other in zip(contacts, there):
-        alike(told(contact), other)
+        alike(reported(contact), other)
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.3])
@@ -426,7 +426,7 @@ def test_walls_that_are_switched(mu, monkeypatch):
         forces = []
         for step in uem.load_steps(problem, steps):
             forces.append([contact.resultant().force for contact in contacts])
-        found.append((problem.u, np.array(forces), told(contacts[0])))
+        found.append((problem.u, np.array(forces), reported(contacts[0])))
         assert (
             contacts[1].n_active and (np.array(forces)[3, 1] == 0.0).all() and len(problem.interfaces) == (1 if together else 3)
         )

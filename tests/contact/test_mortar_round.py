@@ -60,7 +60,7 @@ class Balls:
         return uem.Tag("part", 1, 2, self.scene.mesh, np.unique(facets).astype(np.int32))
 
     def part(self, k, where):
-        """Facets of a ball whose corners' heights above its middle are all as asked."""
+        """Facets of a ball whose corners' heights above its middle are all as given."""
 
         def on(side):
             return lambda x: side(x) & where((self.mapped(x, k) - self.centres[k])[:, 2])
@@ -83,8 +83,8 @@ def test_a_ball_on_three(n, seed):
 
 
 @pytest.mark.slow
-def test_rows_do_not_depend_on_who_is_active():
-    """Whoever is active: rows and gaps stay, and what P and c allow closes the gaps of all active contactors to first order."""
+def test_rows_do_not_depend_on_the_active_set():
+    """Rows and gaps do not depend on the active set, and what P and c allow closes the gaps of all active contactors to first order."""
     b = Balls(4, 0.2, 0)
     run(b.problem)
     pair, system = b.contact.pair, b.problem.system

@@ -63,7 +63,7 @@ def test_rows_against_slow_quadrature(degree):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_rows_do_not_depend_on_who_is_active(cell):
+def test_rows_do_not_depend_on_the_active_set(cell):
     """Gaps and multipliers of a linearised problem are conjugate: any active set finds the same equations across the target."""
     b = Blocks(
         cell, (3, 4), degree=2 if cell == "quadrilateral" else 1, gap=-0.01, narrow=0.55, contactor="lower", max_penetration=1.0

@@ -124,11 +124,11 @@ def test_curvature_against_differences(cell, target, offset):
     assert all(np.abs(blocks - blocks.transpose(0, 2, 1)).max() == 0.0 for _, blocks in parts)
     for way, (ahead, behind), h in phi.ways(cell):
         measured = -(phi.forces(ahead) - phi.forces(behind)) / h
-        told = np.zeros(len(phi.start))
+        reported = np.zeros(len(phi.start))
         for nodes, blocks in parts:
             index = (nodes[:, :, None] * phi.g + np.arange(phi.g)).reshape(len(nodes), -1)
-            np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
-        assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
+            np.add.at(reported, index, np.einsum("kij,kj->ki", blocks, way[index]))
+        assert np.abs(measured - reported).max() < 1e-5 * np.abs(measured).max()
 
 
 @pytest.mark.slow
@@ -148,11 +148,11 @@ def test_sides_of_quadratic_facets(cell, target, monkeypatch):
     ahead, behind = phi.start + h * way, phi.start - h * way
     slope = (phi.value(ahead) - phi.value(behind)) / (2 * h)
     assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
-    measured, told = -(phi.forces(ahead) - phi.forces(behind)) / (2 * h), np.zeros(len(way))
+    measured, reported = -(phi.forces(ahead) - phi.forces(behind)) / (2 * h), np.zeros(len(way))
     for nodes, blocks in parts:
         index = (nodes[:, :, None] * 3 + np.arange(3)).reshape(len(nodes), -1)
-        np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
-    assert np.abs(measured - told).max() < 1e-5 * np.abs(measured).max()
+        np.add.at(reported, index, np.einsum("kij,kj->ki", blocks, way[index]))
+    assert np.abs(measured - reported).max() < 1e-5 * np.abs(measured).max()
 
 
 @pytest.mark.parametrize("cell,target,offset", SCENES)
@@ -181,11 +181,11 @@ def test_circles(target, offset):
     for way, (ahead, behind), h in phi.ways("triangle"):
         slope = (phi.value(ahead) - phi.value(behind)) / h
         assert slope == pytest.approx(first @ way, rel=1e-6, abs=1e-8 * np.abs(first).sum())
-        measured, told = -(phi.forces(ahead) - phi.forces(behind)) / h, np.zeros(len(phi.start))
+        measured, reported = -(phi.forces(ahead) - phi.forces(behind)) / h, np.zeros(len(phi.start))
         for nodes, blocks in parts:
             index = (nodes[:, :, None] * 2 + np.arange(2)).reshape(len(nodes), -1)
-            np.add.at(told, index, np.einsum("kij,kj->ki", blocks, way[index]))
-        assert np.abs(measured - told).max() < 1e-4 * np.abs(measured).max()
+            np.add.at(reported, index, np.einsum("kij,kj->ki", blocks, way[index]))
+        assert np.abs(measured - reported).max() < 1e-4 * np.abs(measured).max()
 
 
 @pytest.mark.parametrize("hollow", [None, 0.5])

@@ -1,4 +1,4 @@
-"""Contact pairs: what they refuse at the start, and who has rows in P."""
+"""Contact pairs: refusals at the start, and contactors with rows in P."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ COMM = MPI.COMM_WORLD
 
 @pytest.mark.parametrize(("part", "refused"), [(0.0167, False), (0.15, True)])
 def test_default_bound_on_the_initial_penetration(part, refused):
-    """An overlap of 1.7 % of the model's size is pressed apart and told, one of 15 % is refused unless it is meant."""
+    """An overlap of 1.7 % of the model's size is pressed apart and reported, one of 15 % is refused unless it is meant."""
     # the model's height is 2 - depth, its width 1
     depth = 0.5
     for _ in range(50):
@@ -34,7 +34,7 @@ def test_default_bound_on_the_initial_penetration(part, refused):
             assert contact.initial_overlap == pytest.approx(depth, rel=1e-9)
 
 
-def test_who_has_rows():
+def test_contactors_with_rows():
     """Those that touch first have rows alone; once another follows, so have all near the target, on any rank alike."""
     b = blocks(COMM, "quadrilateral", 2, 4, gap=0.01)
     contact = uem.Contact(b.high, b.low, normals="averaged")

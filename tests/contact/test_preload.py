@@ -163,12 +163,12 @@ def test_turned_at_finite_strain(cell, coupling):
 
 
 @pytest.mark.parametrize("locked", [False, True])
-def test_goes_on_from_a_checkpoint(tmp_path, locked):
+def test_continues_from_a_checkpoint(tmp_path, locked):
     """A run that goes on from a file is the run that was not interrupted, to the last bit, free or locked."""
     path, kept, found = COMM.bcast(str(tmp_path / "state")), [], []
-    for goes_on in (False, True):
+    for continues in (False, True):
         j = Joint("mortar", force=0.03)
-        if goes_on:
+        if continues:
             uem.read_checkpoint(path, j.problem.state())
         else:
             j.problem.solve()

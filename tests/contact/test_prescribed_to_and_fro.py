@@ -14,7 +14,7 @@ from uem_dolfinx.contact.friction.stick_slip import continues
 MU, PRESSURE, WAY = 0.2, 100.0, 0.3
 
 
-def test_slip_along_conditions_goes_on():
+def test_slip_along_conditions_continues():
     """Slip along a prescribed component goes on, slip across it or without a direction does not, nor that of those that have moved."""
     free = np.zeros((6, 2, 3))
     free[:, 0, 0] = 1.0

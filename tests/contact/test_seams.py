@@ -44,7 +44,7 @@ def rigid_wave(g, along):
 
 
 def pulled(x):
-    """A periodic displacement along the first direction, none at multiples of a half, beside which facets get other sizes."""
+    """A periodic displacement along the first direction, none at multiples of a half, next to which facets get other sizes."""
     return np.eye(x.shape[1])[0] * np.sin(2 * np.pi * x[:, :1]) ** 2
 
 

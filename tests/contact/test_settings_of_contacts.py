@@ -81,7 +81,7 @@ def test_what_is_settled(name, value):
 
 
 def test_what_a_contact_has_not():
-    """A misspelt attribute is told, before and after the problem is made."""
+    """A misspelt attribute is reported, before and after the problem is made."""
     contact = driven("quadrilateral", 0.1).contact
     new = uem.Contact(contact.contactor, uem.RigidPlane([0.0, 0.0], [0.0, 1.0]))
     for one in (contact, new):

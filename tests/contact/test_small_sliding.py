@@ -77,7 +77,7 @@ def test_force_on_an_incline_is_normal_to_it(cell, rigid, sliding):
         np.testing.assert_allclose(force, finite, atol=1e-9 * force[-1])
 
 
-def test_wear_on_a_slope_goes_on_from_a_checkpoint(folder):
+def test_wear_on_a_slope_continues_from_a_checkpoint(folder):
     """Slip is measured by the rows of its own step: a resumed run is the uninterrupted one."""
 
     def advance(run, steps):

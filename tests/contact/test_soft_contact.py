@@ -236,7 +236,7 @@ def test_units_of_length(unit):
     assert closed(unit) == pytest.approx(closed(1.0), rel=1e-9)
 
 
-def test_a_run_that_goes_on(folder):
+def test_a_run_that_continues(folder):
     """From a checkpoint a run goes on as if it had not ended; another law is named."""
 
     def begun(law=ROUGH):

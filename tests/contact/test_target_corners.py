@@ -24,13 +24,13 @@ from uem_dolfinx.contact.warnings.target_corners import corner_nodes
 COMM = MPI.COMM_WORLD
 
 
-def told(caplog):
+def reported(caplog):
     """Warnings of corners on rank 0, on all ranks."""
     return COMM.bcast([r.getMessage() for r in caplog.records if "a convex corner of the target" in r.getMessage()])
 
 
 def place(message):
-    """Of the corner that a message tells of."""
+    """The corner that a message names."""
     return [float(number) for number in re.search(r"at \((.*?)\)", message)[1].split(",")]
 
 
@@ -56,20 +56,20 @@ def test_corners_that_are_warned_of(make, how, caplog):
     """Once, with contact and place; not where they are the contactors'."""
     (problem, *_), tips = make(**how)
     run(problem, 2)
-    (message,) = told(caplog)
+    (message,) = reported(caplog)
     assert message.startswith("pair: ") and "swap the two" in message and "mortar" in message
     assert min(abs(place(message)[0] - how.get("size", 1.0) * tip) for tip in tips) < 1e-5 * how.get("size", 1.0)
     if make is wedge and how["slope"] == 0.5:
         caplog.clear()
         (problem, *_), _ = make(**how, swap=True)
         run(problem, 2)
-        assert not told(caplog)
+        assert not reported(caplog)
 
 
 def test_corners_under_mortar_are_seen(caplog):
     (problem, contact, _), _ = wedge(coupling="mortar")
     run(problem, 2)
-    assert contact.n_active and not told(caplog)
+    assert contact.n_active and not reported(caplog)
 
 
 def flat(swap, n, overhang=0.0):
@@ -108,14 +108,14 @@ HARMLESS = {
 def test_harmless_scenes(name, caplog):
     problem = HARMLESS[name]()
     run(problem)
-    assert problem.contacts[0].n_active and not told(caplog)
+    assert problem.contacts[0].n_active and not reported(caplog)
 
 
 def test_a_corner_that_is_dragged(caplog):
     """Without friction the drag vanishes; the slab's nodes leave some, and a warning says why. The die's nodes, with mortar, do not."""
-    assert np.abs(ironing(1)).max() > 0.08 and len(told(caplog)) == 1
+    assert np.abs(ironing(1)).max() > 0.08 and len(reported(caplog)) == 1
     caplog.clear()
-    assert np.abs(ironing(1, swap=True, coupling="mortar")).max() < 0.03 and not told(caplog)
+    assert np.abs(ironing(1, swap=True, coupling="mortar")).max() < 0.03 and not reported(caplog)
 
 
 def shallow(press, swap):
@@ -243,5 +243,5 @@ def test_a_polygon_that_turns_in_its_hole(m, swap, factor, expected, caplog, mon
     monkeypatch.setattr(target_corners, "LACKING_AT_VERTICES", factor * target_corners.LACKING_AT_VERTICES)
     problem, _ = turning_plug(m, 1e-4, swap)
     run(problem)
-    assert len(told(caplog)) == expected
-    assert all("swap the two" in message and "corners = True" not in message for message in told(caplog))
+    assert len(reported(caplog)) == expected
+    assert all("swap the two" in message and "corners = True" not in message for message in reported(caplog))

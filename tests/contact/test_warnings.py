@@ -24,8 +24,8 @@ from uem_dolfinx.geometry.search import MeshTarget
 COMM = MPI.COMM_WORLD
 
 
-def told(caplog, words):
-    """How often rank 0 was told these words, on all ranks."""
+def reported(caplog, words):
+    """How often rank 0 has logged these words, on all ranks."""
     return COMM.bcast(sum(words in r.getMessage() for r in caplog.records))
 
 
@@ -64,14 +64,14 @@ def test_surfaces_that_conform(hole_first, part, expected, size, caplog):
     for n, wanted in ((10, expected), (4, 0)):
         caplog.clear()
         pin_in_hole(part * SAG * (10 / n) ** 2, *((n, 25) if hole_first else (25, n)), size=size, hole_first=hole_first)
-        assert told(caplog, "the surfaces conform") == wanted
+        assert reported(caplog, "the surfaces conform") == wanted
 
 
 @pytest.mark.parametrize("kind", ["same nodes", "3D"])
 def test_surfaces_that_conform_otherwise(kind, caplog):
     """Surfaces with the same nodes touch alike however their facets sag; in 3D a warning names it as in the plane."""
     pin_in_hole(0.3 * SAG, 10 if kind == "same nodes" else 25, 10, g=3 if kind == "3D" else 2)
-    assert told(caplog, "the surfaces conform") == (kind == "3D")
+    assert reported(caplog, "the surfaces conform") == (kind == "3D")
 
 
 def two_discs(gap, n):
@@ -89,7 +89,7 @@ def two_discs(gap, n):
 @pytest.mark.parametrize("n", [6, 20, 41])
 def test_surfaces_that_touch_in_a_point(gap, n, caplog):
     two_discs(gap, n)
-    assert told(caplog, "the surfaces conform") == 0
+    assert reported(caplog, "the surfaces conform") == 0
 
 
 @pytest.mark.parametrize("n, curved", [(2, False), (4, True)])
@@ -103,7 +103,7 @@ def test_corners_are_no_curves(n, curved, caplog):
     assert largest == (pytest.approx(1.0, rel=0.05) if curved else 0.0)
     b = blocks(COMM, "quadrilateral", 4, 9)
     uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, contacts=[uem.Contact(b.high, b.low)])
-    assert told(caplog, "the surfaces conform") == 0
+    assert reported(caplog, "the surfaces conform") == 0
 
 
 # -- contactors that stay inside ------------------------------------------------------------------------------------------
@@ -178,9 +178,9 @@ def test_straight_facets_of_a_curved_mesh(degree, bulge, expected, caplog):
     facets = dmesh.locate_entities_boundary(mesh, 1, lambda x: x[1] < 0.25)
     contact = uem.Contact(facets, uem.RigidPlane((0.0, -0.2), (0.0, 1.0)))
     uem.UnitedProblem(linear(u, 1.0), u, contacts=[contact])
-    assert told(caplog, "replaces the curved facets") == expected
+    assert reported(caplog, "replaces the curved facets") == expected
     # a parabola of height 0.1 on two facets of half its width
-    assert told(caplog, "up to 0.025 away") == expected
+    assert reported(caplog, "up to 0.025 away") == expected
 
 
 # -- ends --------------------------------------------------------------------------------------------------------------
@@ -209,20 +209,20 @@ def test_contactors_that_slip_off(n, expected, caplog, monkeypatch):
     """Told, once, where what they carried is a good part of the contact."""
     contact = slipping(n, 0.4)
     assert COMM.allreduce(int(contact.pair.off.sum())) == 1
-    assert told(caplog, "slid off the end of the target") == expected
+    assert reported(caplog, "slid off the end of the target") == expected
     share = COMM.allgather(float(contact._areas.sum()))
     assert sum(share) == pytest.approx(1.0)
     for threshold, wanted in ((10 * checks.SLIPPED, 0), (0.1 * checks.SLIPPED, 1)):
         caplog.clear()
         monkeypatch.setattr(checks, "SLIPPED", threshold)
         slipping(n, 0.4)
-        assert told(caplog, "slid off the end of the target") == wanted
+        assert reported(caplog, "slid off the end of the target") == wanted
 
 
 @pytest.mark.parametrize("overhang", [0.25, 0.5])
 def test_contactors_that_stay_on(overhang, caplog):
     bulging(4, overhang)
-    assert told(caplog, "slid off") == 0
+    assert reported(caplog, "slid off") == 0
 
 
 def test_contactors_that_were_never_on(caplog):
@@ -231,7 +231,7 @@ def test_contactors_that_were_never_on(caplog):
     contact = uem.Contact(b.low, b.high)
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=(0.0, -0.1))]
     run(uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=bcs, contacts=[contact]), 2)
-    assert contact.n_active and told(caplog, "slid off") == 0
+    assert contact.n_active and reported(caplog, "slid off") == 0
 
 
 @pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
@@ -250,4 +250,4 @@ def test_slim_tips(coupling, angle, slim, cell, caplog):
     u = fem.Function(compat.function_space(s.mesh, 1, (g,)))
     low, high = s.tag("tip", 1, lambda x: np.abs(x[:, -1]) < 1e-9), s.tag("top", 0, lambda x: np.abs(x[:, -1] + 3) < 1e-9)
     uem.UnitedProblem(linear(u, modulus(s, 1.0, 1.0)), u, contacts=[uem.Contact(low, high, coupling=coupling)])
-    assert told(caplog, "meet at less than 40 degrees") == (slim and coupling == "mortar")
+    assert reported(caplog, "meet at less than 40 degrees") == (slim and coupling == "mortar")

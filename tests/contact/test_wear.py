@@ -155,7 +155,7 @@ def test_a_step_taken_again_wears_once():
 
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
-def test_wear_goes_on_from_a_checkpoint(coupling, folder):
+def test_wear_continues_from_a_checkpoint(coupling, folder):
     """A run that goes on from a file ends as the one that was left alone, to the last bit in serial."""
     whole, first, last = (Pin(friction=0.1, press=None, coupling=coupling) for _ in range(3))
     whole.slide(4)
@@ -173,13 +173,13 @@ def test_wear_goes_on_from_a_checkpoint(coupling, folder):
 
 
 def test_steps_that_wear_too_much(caplog):
-    """Beyond explicit Euler's bound of the surface a warning tells of it; below there is none."""
+    """Beyond explicit Euler's bound of the surface a warning names it; below there is none."""
     for k, warned in ((2.0, False), (8.0, True)):
         caplog.clear()
         with caplog.at_level(logging.WARNING):
             Pin(wear=k).slide(2)
-        told = COMM.bcast(any("take turns in bearing" in record.message for record in caplog.records))
-        assert told == warned
+        reported = COMM.bcast(any("take turns in bearing" in record.message for record in caplog.records))
+        assert reported == warned
 
 
 def test_the_law():

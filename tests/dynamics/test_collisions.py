@@ -226,8 +226,8 @@ def test_corners_that_come_back_below_the_target_are_left_out(contactors, n, nam
     energy = np.array([row.kinetic + row.stored for row in book.rows])
     assert np.abs(energy / energy[0] - 1.0).max() <= 1e-11 and contact.n_active == 0
     assert COMM.allreduce(int(problem.pairs[0].trial.barred.sum())) == named
-    told = [record for record in caplog.records if "slid past the end" in record.getMessage()]
-    assert COMM.rank != 0 or sum(int(re.search(r": (\d+) contactors", record.getMessage())[1]) for record in told) == named
+    reported = [record for record in caplog.records if "slid past the end" in record.getMessage()]
+    assert COMM.rank != 0 or sum(int(re.search(r": (\d+) contactors", record.getMessage())[1]) for record in reported) == named
 
 
 def test_both_sides_are_massless_where_bodies_can_carry_it(caplog):
@@ -245,8 +245,8 @@ def test_both_sides_are_massless_where_bodies_can_carry_it(caplog):
         return found, "swap contactor and target" in caplog.text
 
     assert warned(1.0, 10.0) == ([False, False], False)
-    told = COMM.rank == 0
-    assert warned(1.0, 10.0, deep=1) == ([True, False], told)
+    reported = COMM.rank == 0
+    assert warned(1.0, 10.0, deep=1) == ([True, False], reported)
     # the ground holds the other side of the rod; its cells are ten times as long as the block's
     assert warned(1.0, 0.05, deep=1) == ([True, False], False)
 
@@ -258,7 +258,7 @@ def test_a_rod_that_keeps_its_mass_takes_a_soft_block():
 
 
 def test_what_part_of_a_surface_could_be_massless():
-    """A block of 5 x 5 elements whose whole boundary is contactor: the error tells how near the part is that it can do without."""
+    """A block of 5 x 5 elements whose whole boundary is contactor: the error contains the distance of the part that may be massless."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.1], [1.0, 1.1], [5, 5])])
     V = compat.function_space(s.mesh, 1, (2,))
     u, v = fem.Function(V), ufl.TestFunction(V)

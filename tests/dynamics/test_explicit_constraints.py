@@ -76,7 +76,7 @@ def test_a_wave_through_a_tie(coupling):
 
 
 def test_led_in_the_mean():
-    """A bar whose foot is led in its mean: exactly, as it is told."""
+    """A bar whose foot has a prescribed mean motion, which it follows exactly."""
     lead = lambda s: [uem.MeanMotion(s.tag("foot", 0, at(1, 0.0)), (0, 1), b=lambda t: 0.3 * t**2)]  # noqa: E731
     problem, _, _, s = bars(equations=lead)
     foot = s.tag("foot", 0, at(1, 0.0))
@@ -200,7 +200,7 @@ def test_a_motor():
 
 
 @pytest.mark.slow
-def test_it_goes_on_from_a_checkpoint(tmp_path):
+def test_it_continues_from_a_checkpoint(tmp_path):
     """A run with a motor, a rigid head and a hinge that stops and goes on ends as the one that does not."""
     path = COMM.bcast(str(tmp_path / "run.h5") if COMM.rank == 0 else None)
 

@@ -17,7 +17,7 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [uem.NeoHooke, uem.LinearElastic])
 @pytest.mark.parametrize("stop", [9, 15])
-def test_it_goes_on_from_a_checkpoint(tmp_path, law, stop):
+def test_it_continues_from_a_checkpoint(tmp_path, law, stop):
     """A run that stops before or during contact and goes on has the steps of the one that does not, and on one rank its last bits."""
     path = COMM.bcast(str(tmp_path / "run.h5") if COMM.rank == 0 else None)
     whole, first, again = (Flight(2, 12, law=law, friction=0.3, speed=14.0) for _ in range(3))

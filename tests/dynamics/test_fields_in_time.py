@@ -62,11 +62,11 @@ class Fall:
 @pytest.mark.parametrize("pressure", [0, 1])
 def test_a_pressure_that_changes_nothing(pressure):
     """Forces of an impact with friction, works and momenta are those of the same block without it, in as many iterations."""
-    alone, beside = Fall(None), Fall(pressure)
-    a, b = alone.go(0.05), beside.go(0.05)
+    alone, among_fields = Fall(None), Fall(pressure)
+    a, b = alone.go(0.05), among_fields.go(0.05)
     assert a.shape == b.shape and a[:, 2].max() > 1.0 and a[-1, 1] != 0.0
     assert np.abs(a - b).max() < 1e-11 * np.abs(a).max()
-    there, own = beside.problem.config.displacement, alone.problem.config.displacement
+    there, own = among_fields.problem.config.displacement, alone.problem.config.displacement
     assert highest(COMM, np.abs(np.linalg.norm(there, axis=1).sum() - np.linalg.norm(own, axis=1).sum())) < 1e-12
 
 

@@ -194,7 +194,7 @@ def test_a_mass_on_a_spring(law):
 
 
 @pytest.mark.slow
-def test_a_run_goes_on(folder):
+def test_a_run_continues(folder):
     """From a checkpoint the run goes on to the last bit, with full turns of the hinge, and a step is taken twice."""
 
     def make():

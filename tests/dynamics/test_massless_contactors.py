@@ -155,7 +155,7 @@ def test_refused_only_where_impossible(cell, everywhere):
 @pytest.mark.parametrize(("make", "between"), [(uem.consistent_mass, 7), (uem.lumped_mass, 6)])
 @pytest.mark.parametrize("cell", CELLS)
 def test_layers_that_the_error_asks_for(cell, make, between):
-    """As many as it tells are enough, behind one surface of contactors and between two."""
+    """As many layers as it names are enough, behind one surface of contactors and between two."""
     g = dimension(cell)
     for layers, ends in ((5, (0.0,)), (between, (0.0, 1.0))):
         s = scene(COMM, cell, [box(cell, [0.0] * g, [1.0] * g, [2] * (g - 1) + [layers])])

@@ -17,7 +17,7 @@ from bar_scenes import Bar
 from body_scenes import Bodies
 from dolfinx import fem
 from helpers import at, box, highest, linear, modulus, refused, scene, slow
-from restart_scenes import goes_on_alike
+from restart_scenes import continues_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -234,7 +234,7 @@ def test_the_same_on_any_ranks():
     assert np.abs(runs[0].energy - runs[1].energy).max() <= 1e-11 * runs[1].start
 
 
-def test_a_run_goes_on(folder):
+def test_a_run_continues(folder):
     """A run that is interrupted in contact goes on alike."""
     path, ends = folder / "run.h5", []
     for stop, checkpoint in ((99, None), (8, path), (99, path)):
@@ -245,7 +245,7 @@ def test_a_run_goes_on(folder):
             if step.number == stop:
                 break
         ends.append(np.concatenate([bars.u.x.array, bars.dynamics.velocity.x.array, bars.contact.force.x.array]))
-    goes_on_alike(ends[2], ends[0])
+    continues_alike(ends[2], ends[0])
 
 
 def test_a_step_is_taken_again():

@@ -162,8 +162,8 @@ def test_the_shape_of_bodies_of_revolution():
     X, n = s.V.tabulate_dof_coordinates(), problem.config.n_owned
     s.mesh.geometry.x[:] = nodes
     own = np.stack([0.3 * X[:, 0] * (1 + X[:, 1]), 0.2 * X[:, 0] * X[:, 1]], axis=1)[:n].ravel()
-    told = COMM.allreduce(float(by_shape.x.array[: 2 * n] @ own))
-    assert (value(h, True) - value(-h, True)) / (2 * h) == pytest.approx(told, rel=1e-5)
+    reported = COMM.allreduce(float(by_shape.x.array[: 2 * n] @ own))
+    assert (value(h, True) - value(-h, True)) / (2 * h) == pytest.approx(reported, rel=1e-5)
     s.mesh.geometry.x[:] = nodes
 
 

@@ -135,7 +135,7 @@ def flat(kind, x):
 @pytest.mark.parametrize("kind", UNIT)
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e3])
 def test_how_thin_a_cell_may_be(kind, size):
-    """The volume over the larger extents, by the largest one, tells how thin a cell is, however it lies and whatever it measures."""
+    """The volume over the larger extents, by the largest one, measures how thin a cell is, at any rotation and size."""
     assert 100 * np.finfo(float).eps < FLAT_CELL
     x = np.array(UNIT[kind], dtype=float)
     g = x.shape[1]

@@ -44,8 +44,8 @@ def warned(caplog, depth=0.05, *, cell="hexahedron", degree=1, shift=1.0 / N, sl
         for _ in uem.load_steps(problem, steps):
             pass
     # rank 0 speaks for all
-    told = [r.getMessage() for r in caplog.records if "sharp edges" in r.getMessage()]
-    return COMM.bcast(told)
+    reported = [r.getMessage() for r in caplog.records if "sharp edges" in r.getMessage()]
+    return COMM.bcast(reported)
 
 
 @pytest.mark.parametrize("unit", [1.0, slow(1e-9), slow(1e3)])
@@ -54,9 +54,9 @@ def test_ridge_over_ridge(caplog, cell, degree, unit):
     """In every step, with the depth and the middle of both ridges, at whatever unit of length."""
     # between nodes of elements of degree 2, too
     shift = 1.0 / N if degree == 1 else 0.5 / N
-    told = warned(caplog, cell=cell, degree=degree, shift=shift, unit=unit, steps=2)
-    assert len(told) == 2 and all(text.startswith("general contact: sharp edges") for text in told)
-    for text, depth in zip(told, (0.025, 0.05)):
+    reported = warned(caplog, cell=cell, degree=degree, shift=shift, unit=unit, steps=2)
+    assert len(reported) == 2 and all(text.startswith("general contact: sharp edges") for text in reported)
+    for text, depth in zip(reported, (0.025, 0.05)):
         found, place = text.partition(" deep")[0].split()[-1], text.partition(" at (")[2].partition(")")[0]
         assert float(found) == pytest.approx(depth * unit, rel=1e-3)
         assert np.array(list(map(float, place.split(",")))) == pytest.approx(
@@ -73,8 +73,8 @@ def test_declared_contacts(caplog, coupling):
         lambda low, high: uem.GeneralContact(max_penetration=1.0, edges=False, **name),
     ):
         caplog.clear()
-        told = warned(caplog, contact=contact)
-        assert len(told) == 1 and told[0].startswith("roofs: sharp edges")
+        reported = warned(caplog, contact=contact)
+        assert len(reported) == 1 and reported[0].startswith("roofs: sharp edges")
 
 
 @pytest.mark.slow

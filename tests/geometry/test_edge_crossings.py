@@ -1,4 +1,4 @@
-"""Crossings of sharp edges: which edges are opposite, who has the equation, and gaps with their derivatives.
+"""Crossings of sharp edges: opposite edges, the node with the equation, and gaps with their derivatives.
 
 Read first: ``test_derivatives``.
 """

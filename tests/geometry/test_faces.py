@@ -23,8 +23,8 @@ def test_opposite_sides_of_a_box(cell, shuffle):
     _, skin = skin_of(cell, boxes, shuffle=shuffle)
     found, count = classes_of_facets(skin)
     axis = np.abs(skin.middles(skin.config.X[skin.dofs])[1]).argmax(axis=1)
-    told = np.unique(np.concatenate(COMM.allgather(np.column_stack([skin.body, axis, found]))), axis=0)
-    assert count == g and len(told) == 2 * g and all(len(np.unique(told[told[:, 0] == b, 2])) == g for b in range(2))
+    reported = np.unique(np.concatenate(COMM.allgather(np.column_stack([skin.body, axis, found]))), axis=0)
+    assert count == g and len(reported) == 2 * g and all(len(np.unique(reported[reported[:, 0] == b, 2])) == g for b in range(2))
 
 
 def test_a_round_body_is_one_face():

@@ -341,12 +341,12 @@ def test_trial_states_far_away_and_back():
     assert listed(n) == before
 
 
-# -- who may touch what ----------------------------------------------------------------------------------------------------
+# -- pairs that may touch --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("lean,faced", [(-0.4, False), (0.3, False), (1.0, True)])
-def test_who_faces_whom(degree, lean, faced):
+def test_facing_pairs(degree, lean, faced):
     """A wall next to a level face holds nodes of it only if it leans over them by more than 30 degrees."""
     low = box("quadrilateral", [0.0, 0.0], [2.0, 1.0], [8, 4])
     wall = box("quadrilateral", [1.02, 1.02], [1.52, 2.02], [2, 8])
@@ -364,8 +364,8 @@ def test_who_faces_whom(degree, lean, faced):
 
 
 @pytest.mark.parametrize("along", [0.3, -0.3])
-def test_who_follows_on_one_body(along):
-    """Of the ends of a ring that face each other that one whose normal points more in the direction that tells, and all corners."""
+def test_contactors_on_one_body(along):
+    """Of opposite ends of a ring the one whose normal points more along the fixed direction, and all corners."""
     d, middle = DIRECTION[:2], 0.02
     turn = np.arctan2(d[1], d[0]) + np.arccos(along / np.linalg.norm(d)) - 0.5 * np.pi
 
@@ -379,8 +379,8 @@ def test_who_follows_on_one_body(along):
         n.update()
         one = n.lists[0]
         assert one.empty != itself
-    told = one.exchange.send(skin.corners[n.nodes], skin.cones(n.nodes)[:, :, 0])
-    corner, cone = (a[one.node] for a in told)
+    reported = one.exchange.send(skin.corners[n.nodes], skin.cones(n.nodes)[:, :, 0])
+    corner, cone = (a[one.node] for a in reported)
     normal = skin.normals()[one.facet][:, 0]
     facing = np.einsum("kcg,kg->kc", cone, normal)
     own = np.take_along_axis(cone, facing.argmin(axis=1)[:, None, None], axis=1)[:, 0]

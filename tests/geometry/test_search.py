@@ -168,7 +168,7 @@ def test_past_an_open_end():
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_on_a_named_facet(cell):
-    """``project_on`` stays on the facet it is told, however far that is."""
+    """``project_on`` stays on the given facet, however far that is."""
     _, config, target = surface(cell)
     x, nodes, _ = all_facets(target)
     points = points_about(config.gdim, 20, 4)
@@ -242,7 +242,7 @@ def test_any_cloud_on_any_number_of_ranks(seed, cell):
 
 
 def test_empty_request():
-    """No rank asks anything."""
+    """No rank has a point."""
     _, config, target = surface("tetrahedron", n=2)
     p = target.project(np.zeros((0, 3)))
     assert p.gap.shape == (0,) and p.nodes.shape == (0, 3)

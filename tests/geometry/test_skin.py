@@ -1,4 +1,4 @@
-"""Surfaces of many bodies as one: whose each facet is, edges round which no facet reaches, normals next to them, who follows whom.
+"""Surfaces of many bodies as one: whose each facet is, edges round which no facet reaches, normals next to them, and the order of bodies.
 
 Two tests to read first: ``test_which_edges_are_sharp`` and ``test_the_finer_follows``.
 """
@@ -41,8 +41,8 @@ def test_bodies_are_numbered_by_the_input(cell, shuffle):
     """By their first cells in what was handed to DOLFINx, whatever the partition."""
     s, skin = skin_of(cell, three(cell, 2, 1, 3), shuffle=shuffle)
     assert skin.n_bodies == 3
-    told = zip(*COMM.allgather((forms.original_cells(s.mesh), s.body)))
-    cells, body = (np.concatenate(part) for part in told)
+    reported = zip(*COMM.allgather((forms.original_cells(s.mesh), s.body)))
+    cells, body = (np.concatenate(part) for part in reported)
     _, first = np.unique(body, return_index=True)
     lowest = [cells[body == b].min() for b in range(3)]
     number = np.argsort(np.argsort(lowest))
@@ -134,7 +134,7 @@ def test_normals_follow_what_turns():
     assert highest(COMM, np.abs(skin.current().nodal_normals - before @ R.T)) < 1e-14
 
 
-# -- who follows whom ------------------------------------------------------------------------------------------------------
+# -- order of bodies -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length", [1e-9, 1.0, 1e6])

@@ -60,8 +60,8 @@ def test_facets_equally_near(apart, alike):
         assert _nearest(pair, np.full(2, distance), high, number, 0.0)[0] == (0 if alike else 1)
 
 
-@pytest.mark.parametrize("height, told", [(0.2, True), (0.05, False)])
-def test_points_past_an_end(height, told):
+@pytest.mark.parametrize("height, reported", [(0.2, True), (0.05, False)])
+def test_points_past_an_end(height, reported):
     """Below a fold and past its end, the plane that is farther counts; where it is past the end rather than below, neither does."""
     upward = set()
     for side in (-1, 1):
@@ -75,7 +75,7 @@ def test_points_past_an_end(height, told):
         p = target.project(np.array([[1.0, -0.01, -0.01 * height]]))
         assert np.allclose(p.foot, [[1.0, 0.0, 0.0]], atol=1e-12)
         upward.add(round(float(target.outward(p)[0, 2]), 9))
-    assert (upward == {1.0}) == told
+    assert (upward == {1.0}) == reported
 
 
 def inside(cell, n=60):

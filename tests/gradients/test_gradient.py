@@ -91,10 +91,10 @@ def test_a_body_that_contact_alone_holds(coupling):
 def test_the_state_is_left_as_it_was(law):
     """A gradient between two steps changes neither the state nor what comes next."""
     s, ends = pressed("triangle", law=law), []
-    for asked in (False, True):
+    for requested in (False, True):
         s.top.value[1] = -0.05
         problem = s.solve()
-        if asked:
+        if requested:
             before = np.array(s.u.x.array)
             uem.gradient(problem, s.J, s.E)
             assert np.array_equal(before, s.u.x.array)
@@ -170,7 +170,7 @@ def test_iterative_solvers():
 
 
 def test_one_sided_contactors_are_warned_of(caplog):
-    """Blocks that touch without force: the gradient is that of one side, and a warning tells of it."""
+    """Blocks that touch without force: the gradient is that of one side, and a warning names it."""
     b = blocks(COMM, "triangle", 2, 4)
     E = fem.Constant(b.scene.mesh, 1.0)
     problem = uem.UnitedProblem(

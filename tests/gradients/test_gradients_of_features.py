@@ -150,8 +150,8 @@ def test_contactors_on_edges(cell, n, expected, caplog):
     problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.01), contacts=[uem.Contact(b.high, b.low)], rtol=1e-12)
     problem.solve()
     uem.gradient(problem, ufl.inner(b.u, b.u) * ufl.dx, ufl.SpatialCoordinate(b.scene.mesh))
-    told = [record.getMessage() for record in caplog.records if "edges between facets" in record.getMessage()]
-    assert COMM.rank > 0 or (len(told) == 1 and f": {expected} contactor(s), the first at (" in told[0])
+    reported = [record.getMessage() for record in caplog.records if "edges between facets" in record.getMessage()]
+    assert COMM.rank > 0 or (len(reported) == 1 and f": {expected} contactor(s), the first at (" in reported[0])
 
 
 def test_nodes_that_moved_in_a_history():

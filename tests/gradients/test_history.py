@@ -27,7 +27,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 def test_of_second_order(cell, rigid, law, names, how):
     """``J(h) - J(0) - h J'`` vanishes with h^2 over all steps, for every kind of control, where the same contactors stick and slip."""
     s = dragged(cell, rigid, law, **how)
-    found, told = s.solve(), {}
+    found, reported = s.solve(), {}
     assert any(0 < stick < active for active, stick in found.states)
     for name, by in zip(names, found.history.gradient(s.J, [control_of(s, found.contact, name) for name in names])):
         change = changed(s, name)
@@ -35,11 +35,11 @@ def test_of_second_order(cell, rigid, law, names, how):
 
         def functional(h, name=name, change=change):
             again, J = drag_anew(s, name, change, h)
-            assert again.states == found.states, f"{name} changes who sticks: take another scene"
+            assert again.states == found.states, f"{name} changes sticking contactors: take another scene"
             return J
 
-        told[name] = uem.taylor_test(functional, slope, 4e-4, 1)
-    assert min(told.values()) >= 1.95, told
+        reported[name] = uem.taylor_test(functional, slope, 4e-4, 1)
+    assert min(reported.values()) >= 1.95, reported
 
 
 @pytest.mark.slow

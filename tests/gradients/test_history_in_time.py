@@ -27,7 +27,7 @@ SCENES = [
 
 
 def changes(s, damped=True, shaken=False, **_):
-    """Of all controls of a scene: what tells it, and a change."""
+    """All controls of a scene, each with a change."""
     two = np.ones(2)
     some = [(s.E, s.E, 90.0), (s.rho, s.rho, 0.1), (s.force, s.force, two), (s.push, s.grows, two)]
     some += [(s.velocity, s.velocity, wave(s.V, 0.2))]

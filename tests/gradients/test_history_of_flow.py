@@ -40,7 +40,7 @@ SCENES = [
 
 
 def changes(s):
-    """Of all controls of a scene: what tells it, and a change."""
+    """All controls of a scene, each with a change."""
     return [(control, control, change) for control, change in changes_of_flow(s)]
 
 
@@ -194,8 +194,8 @@ def test_slopes_of_the_return_in_finite_strain(kind, curve, moves):
         if i == 5 and curve == "voce":
             continue
         ends = [counted([*begin[:i], begin[i] + h * change, *begin[i + 1 :]]) for h in (-1e-5, 1e-5)]
-        told = (found[i] * change).reshape(n, -1).sum(axis=1)
-        assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(told, rel=1e-6, abs=1e-6 * np.abs(told).max()), i
+        reported = (found[i] * change).reshape(n, -1).sum(axis=1)
+        assert (ends[1] - ends[0]) / 2e-5 == pytest.approx(reported, rel=1e-6, abs=1e-6 * np.abs(reported).max()), i
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.45])

@@ -89,7 +89,7 @@ def test_through_plastic_flow(how):
 
 
 def test_of_locked_sections():
-    """A bolt keeps the opening that its force has given it; without friction the last step but for that tells its derivative."""
+    """A bolt keeps the opening that its force has given it; without friction the step before the last determines its derivative."""
     b = blocks(COMM, "triangle", 3, 4, overhang=0.2)
     E, load = fem.Constant(b.scene.mesh, 1.0), fem.Constant(b.scene.mesh, np.zeros(2))
     v = ufl.TestFunction(b.V)

@@ -51,7 +51,7 @@ def test_linear_simplices_lock_as_documented(comm, cell):
     [("quadrilateral", 8, 1, 0.056), ("quadrilateral", 4, 2, 0.042), ("triangle", 4, 2, 0.070), ("triangle", 8, 1, 0.24)],
 )
 def test_limit_load_of_a_punch(comm, cell, n, degree, error):
-    """Errors against Prandtl's 2 + pi, that the docstring of ``VonMises`` tells."""
+    """Errors against Prandtl's 2 + pi, as in the docstring of ``VonMises``."""
     s = scene(comm, cell, [box(cell, [0.0, -2.0], [4.0, 0.0], [4 * n, 2 * n])])
     V = compat.function_space(s.mesh, degree, (2,))
     u, punch = fem.Function(V), s.tag("punch", 0, lambda x: (np.abs(x[:, 1]) < 1e-9) & (x[:, 0] < 1 + 1e-9))

@@ -160,7 +160,7 @@ class Unsendable(Exception):
         super().__init__(f"{one} {two}")
 
 
-@pytest.mark.parametrize("error", [KeyError("a"), Unsendable(1, 2)], ids=["sent", "told"])
+@pytest.mark.parametrize("error", [KeyError("a"), Unsendable(1, 2)], ids=["sent", "reported"])
 def test_agreed(error):
     """What one rank raises in a block is raised on all at its end, by its words where it cannot be sent."""
     kind = RuntimeError if isinstance(error, Unsendable) and COMM.size > 1 else type(error)

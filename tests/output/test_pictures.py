@@ -312,9 +312,11 @@ def test_films_by_ffmpeg(folder):
     for _ in uem.animate(folder / "a.mp4", problem, uem.load_steps(problem, 4), frames_per_second=5):
         pass
     if COMM.rank == 0:
-        asked = ["-v", "error", "-count_frames", "-show_entries", "stream=nb_read_frames,r_frame_rate", "-of", "csv=p=0"]
-        told = subprocess.run(["ffprobe", *asked, str(folder / "a.mp4")], check=True, capture_output=True, text=True).stdout
-        assert told.split() == ["5/1,4"]
+        requested = ["-v", "error", "-count_frames", "-show_entries", "stream=nb_read_frames,r_frame_rate", "-of", "csv=p=0"]
+        reported = subprocess.run(
+            ["ffprobe", *requested, str(folder / "a.mp4")], check=True, capture_output=True, text=True
+        ).stdout
+        assert reported.split() == ["5/1,4"]
 
 
 def test_films_that_are_refused(folder, monkeypatch):

@@ -89,12 +89,12 @@ def test_columns_that_are_chosen(folder: Path, cell: str) -> None:
     axes, u = "xyz"[: problem.config.gdim], problem.u
     lowest = helpers.highest(comm, -problem.config.X[:, -1]) * -1.0
     foot = mesh.locate_entities_boundary(problem.config.mesh, len(axes) - 1, lambda x: np.isclose(x[len(axes) - 1], lowest))
-    asked = {
+    requested = {
         "energy": lambda: 0.5 * len(axes),
         "mean": lambda: [uem.integrate(u[k] * ufl.dx) for k in range(len(axes))],
         "pair": lambda: [1.0, 2.0, 3.0, 4.0],
     }
-    with uem.ResultsWriter(folder / "blocks", problem, reaction={"foot": foot}, columns=asked) as writer:
+    with uem.ResultsWriter(folder / "blocks", problem, reaction={"foot": foot}, columns=requested) as writer:
         for step in uem.load_steps(problem, 2):
             writer.write(step)
     first, last = rows(folder / "blocks.csv")

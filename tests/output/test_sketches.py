@@ -225,7 +225,7 @@ def test_temperatures_and_ties():
 
 
 def test_bodies_of_revolution():
-    """The axis is told, and forces on a body are those on all of it."""
+    """The axis is named, and forces on a body are those on all of it."""
     s, V, u, left, right = bar()
     uem.axisymmetric(s.mesh)
     v = ufl.TestFunction(V)
@@ -345,15 +345,15 @@ def test_drawn_in_space(folder):
 
 
 def test_demos_have_sketches():
-    """Each of the gallery has one, of few bytes, unless it is told that there is none; what is told are arguments that there are."""
+    """Each of the gallery has one, of few bytes, unless the list says None; all arguments in the list exist."""
     names = re.findall(r"^### \[(\w+)\.py\]", (DEMOS / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
     lines = (DEMOS / "sketches.txt").read_text(encoding="utf-8").splitlines()
-    told = {name: ast.literal_eval(how) for name, how in (line.split(": ", 1) for line in lines if not line.startswith("#"))}
+    reported = {name: ast.literal_eval(how) for name, how in (line.split(": ", 1) for line in lines if not line.startswith("#"))}
     drawn = {path.stem.removesuffix("_setup"): path for path in (DEMOS / "pictures").glob("*_setup.png")}
-    assert told.keys() <= set(names) and drawn.keys() == set(names) - {name for name, how in told.items() if how is None}
+    assert reported.keys() <= set(names) and drawn.keys() == set(names) - {name for name, how in reported.items() if how is None}
     assert max(path.stat().st_size for path in drawn.values()) <= 25_000
     known = set(inspect.signature(uem.plot_setup).parameters) | {"problem", "small"}
-    assert all(how.keys() <= known for how in told.values() if how is not None)
+    assert all(how.keys() <= known for how in reported.values() if how is not None)
 
 
 @serial

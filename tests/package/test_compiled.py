@@ -16,15 +16,15 @@ from uem_dolfinx import compat, compiled, forms
 @pytest.fixture
 def looked_up(monkeypatch):
     """What DOLFINx compiles or finds in its cache, in a process that has compiled nothing yet."""
-    asked, compile_anew = [], jit.ffcx_jit
+    requested, compile_anew = [], jit.ffcx_jit
 
     def ffcx_jit(comm, what, *args, **options):
-        asked.append(what)
+        requested.append(what)
         return compile_anew(comm, what, *args, **options)
 
     monkeypatch.setattr(jit, "ffcx_jit", ffcx_jit)
     monkeypatch.setattr(compiled, "_known", {})
-    return asked
+    return requested
 
 
 @pytest.mark.parametrize("cell, finer", [("triangle", 3), ("hexahedron", 2)])

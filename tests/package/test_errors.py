@@ -150,7 +150,7 @@ def test_initial_penetration_beyond_the_bound():
 
 
 def test_initial_penetration_below_the_bound_is_resolved(caplog):
-    """An interference fit: the overlap is told, becomes pressure, and the gap is closed."""
+    """An interference fit: the overlap is reported, becomes pressure, and the gap is closed."""
     b = blocks(COMM, "quadrilateral", 2, 4, gap=-0.02)
     bcs = b.oedometer(0.0)
     contact = uem.Contact(b.high, b.low, max_penetration=0.03)

@@ -121,11 +121,11 @@ def test_a_tangent_of_the_user():
 
 def test_options_of_the_compiler(monkeypatch):
     """They come to the compiler for the forms of this problem and this form, and for no others."""
-    asked, compile_anew = [], jit.ffcx_jit
+    requested, compile_anew = [], jit.ffcx_jit
 
     def ffcx_jit(comm, what, *args, **options):
         if isinstance(what, ufl.Form):
-            asked.append((options.get("jit_options") or options.get("jit_params") or {}).get("timeout"))
+            requested.append((options.get("jit_options") or options.get("jit_params") or {}).get("timeout"))
         return compile_anew(comm, what, *args, **options)
 
     monkeypatch.setattr(jit, "ffcx_jit", ffcx_jit)
@@ -133,10 +133,10 @@ def test_options_of_the_compiler(monkeypatch):
     number = 1.0 + 0.37 * ufl.SpatialCoordinate(b.scene.mesh)[0] ** 2
     uem.UnitedProblem(linear(b.u, number), b.u, bcs=clamp(b.V, b.bottom) + clamp(b.V, b.top), jit_options={"timeout": 234})
     uem.form(number * ufl.dx, jit_options={"timeout": 235})
-    assert set(asked) == {234, 235}
-    asked.clear()
+    assert set(requested) == {234, 235}
+    requested.clear()
     uem.integrate((number + 1) * ufl.dx)
-    assert len(asked) == 1 and asked[0] not in (234, 235)
+    assert len(requested) == 1 and requested[0] not in (234, 235)
 
 
 def test_settings_of_newton():

@@ -107,10 +107,10 @@ def test_options_that_petsc_has_no_use_for(options, near, caplog):
         scene(), petsc_options={"ksp_type": "cg", "pc_type": "jacobi", "ksp_atol": 1e-30, "ksp_max_it": 500} | options
     )
     run(problem, 2)
-    told = [r.getMessage() for r in caplog.records if "was not used" in r.getMessage()]
+    reported = [r.getMessage() for r in caplog.records if "was not used" in r.getMessage()]
     (key,) = options
     if COMM.rank == 0:
-        assert len(told) == 1 and repr(key) in told[0] and near in told[0]
+        assert len(reported) == 1 and repr(key) in reported[0] and near in reported[0]
 
 
 @pytest.mark.parametrize("where", ["scalar", "collapsed", "second", "mesh", "mixed"])
@@ -360,12 +360,12 @@ def test_functions_of_rigid_surfaces(what, wrong, error, words, everywhere):
         bad[0] = everywhere or COMM.rank == COMM.allgather(bool(owned.any())).index(True)
         return b
 
-    def asked(x):
+    def requested(x):
         return (wrong if bad[0] and now[0] else right[what])(x)
 
     b = drawn()
 
-    tool = uem.RigidSurface(**(right | {what: asked}), name="anvil")
+    tool = uem.RigidSurface(**(right | {what: requested}), name="anvil")
     problem = pressed(
         b, contacts=[uem.Contact(b.high, tool)], bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=(0.0, -0.01))]
     )

@@ -1,4 +1,4 @@
-"""What is handed to materials, dynamics, writers and helpers of scripts is looked at as ``test_inputs`` tells of problems."""
+"""Arguments of materials, dynamics, writers and helpers of scripts are checked as ``test_inputs`` does for problems."""
 
 from __future__ import annotations
 

@@ -46,9 +46,9 @@ def made(folder):
 def test_misspelt(folder):
     """Nothing takes an attribute that it has not, whichever class it is of; private ones are the package's business."""
     for name, one in made(folder).items():
-        with pytest.raises((uem.InputError, AttributeError)) as told:
+        with pytest.raises((uem.InputError, AttributeError)) as reported:
             one.misspelt = 1
-        assert "misspelt" in str(told.value), name
+        assert "misspelt" in str(reported.value), name
 
 
 def test_a_note():

@@ -105,7 +105,7 @@ def test_any_ranks_to_any_ranks(cell, chunk, folder, monkeypatch):
     # a name of more than 256 bytes
     long = folder / ("a" * 150) / ("b" * 150) / "all"
     uem.write_checkpoint(long, uem.State(here, fields_on(here, 1), numbers=dict(numbers)))
-    # the same bytes, whoever writes them
+    # the same bytes, on all ranks
     assert (folder / "one").read_bytes() == long.read_bytes()
     for file, mesh in product(("one", long), (here, alone)):
         state = uem.State(mesh, fields_on(mesh), numbers=dict.fromkeys(numbers))
@@ -146,7 +146,7 @@ def test_fingerprint():
     assert len({mine, *others}) == 4
 
 
-def facets_told(target):
+def facets_of(target):
     """Middles of all facets of a target by their number, on every rank."""
     facets = target.facets
     return np.concatenate(facets.config.comm.allgather(facets.config.X[facets.dofs].mean(axis=1)))
@@ -154,7 +154,7 @@ def facets_told(target):
 
 def random_state(pair, seed):
     """A state that depends on the contactors' places alone, with facets by theirs."""
-    g, middles = pair.config.gdim, facets_told(pair.target)
+    g, middles = pair.config.gdim, facets_of(pair.target)
     r = noise(pair.config.X[pair.nodes], 5 + 2 * g, seed)
     by_place = np.append(np.lexsort(np.round(middles, 6).T), -1)
     facets = by_place[np.floor(0.499 * (1 + r[:, :g]) * len(by_place)).astype(int)]
@@ -294,7 +294,7 @@ def test_moving_rigid_surface(sliding, coupling, folder):
     assert np.abs(u).max() > 0.01 and np.abs(u - v).max() <= (0.0 if COMM.size == 1 else 1e-9 * np.abs(u).max())
 
 
-def test_multigrid_goes_on_too(folder):
+def test_multigrid_continues_too(folder):
     """What a preconditioner has learnt is no part of the state: a run that writes and one that reads go on from the same."""
 
     def make():
@@ -320,7 +320,7 @@ def test_multigrid_goes_on_too(folder):
     assert np.abs(u - v).max() <= (0.0 if COMM.size == 1 else 1e-8 * np.abs(u).max())
 
 
-def test_falling_body_goes_on(folder):
+def test_falling_body_continues(folder):
     """A body that only contact holds: where it is supported against neutral motions does not depend on earlier steps."""
 
     def make():

@@ -146,6 +146,6 @@ def test_left_by_one_rank(folder, monkeypatch):
         if COMM.rank == 0:
             steps.close()
             raise OwnError
-    # those who come later do not wait for it
+    # ranks that come later do not wait for it
     steps.close()
     assert not (folder / "run").exists()

@@ -22,7 +22,7 @@ from results_scenes import rows, same_series, series
 import uem_dolfinx as uem
 
 
-def told(steps):
+def reported(steps):
     """What is the same in two runs to the last bit, on any number of ranks to rounding."""
     return [(s.number, s.cuts, s.newton_iterations, round(s.factor, 12)) for s in steps]
 
@@ -68,12 +68,12 @@ def test_interrupted_is_uninterrupted(kind, stops, folder):
     done, made = 0, 0
     for stop in stops:
         found = RAMPS[kind](COMM).run(folder, every=2, stop=stop)
-        assert told(found) == told(steps[done : done + stop])
+        assert reported(found) == reported(steps[done : done + stop])
         made, done = done + stop, kept(kind, folder)
         # a step that was left is not counted
         assert made - 2 <= done < made
     last = RAMPS[kind](COMM)
-    assert told(last.run(folder, every=2)) == told(steps[done:])
+    assert reported(last.run(folder, every=2)) == reported(steps[done:])
     same_end(kind, last, folder)
 
 
@@ -107,7 +107,7 @@ def test_begun_by_the_load_steps(folder):
     COMM.barrier()
     last = RAMPS["ramped"](COMM)
     end = list(last.steps(uem.Checkpoint(folder / "run", every=1)))
-    assert told(end) == told(uninterrupted("ramped")[1][4:])
+    assert reported(end) == reported(uninterrupted("ramped")[1][4:])
 
 
 def test_read_back(folder):
@@ -120,7 +120,7 @@ def test_read_back(folder):
             uem.write_checkpoint(folder / "kept", state)
     a = one.scene.gather(one.problem.u)
     uem.read_checkpoint(folder / "kept", state)
-    assert told(list(uem.load_steps(one.problem, n))) == told(uninterrupted("loaded")[1][2:])
+    assert reported(list(uem.load_steps(one.problem, n))) == reported(uninterrupted("loaded")[1][2:])
     np.testing.assert_allclose(one.scene.gather(one.problem.u), a, rtol=0, atol=1e-12)
 
 

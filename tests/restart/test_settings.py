@@ -128,13 +128,13 @@ def test_settings_without_a_default(folder):
 
 def test_other_steps_are_reported(folder, caplog):
     """Steps of another length are no other run: a warning says it, once."""
-    for end, dt, told in ((0.02, 0.01, 0), (0.04, 0.01, 0), (0.08, 0.02, 1), (0.1, 0.02, 0)):
+    for end, dt, reported in ((0.02, 0.01, 0), (0.04, 0.01, 0), (0.08, 0.02, 1), (0.1, 0.02, 0)):
         caplog.clear()
         with caplog.at_level(logging.WARNING):
             for _ in uem.time_steps(made(friction=0.0), dt, end, checkpoint=uem.Checkpoint(folder / "run")):
                 pass
         messages = [r.getMessage() for r in caplog.records if "continuing with steps" in r.getMessage()]
-        assert len(messages) == (told if COMM.rank == 0 else 0), (dt, messages)
+        assert len(messages) == (reported if COMM.rank == 0 else 0), (dt, messages)
         assert not messages or messages[0] == "continuing with steps of 0.02; the steps before the checkpoint were 0.01"
 
 

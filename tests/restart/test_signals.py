@@ -29,7 +29,7 @@ ENDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: SystemExit}
 
 @pytest.fixture(autouse=True)
 def handlers():
-    """Python's own handler of Ctrl-C and one that tells of SIGTERM, which are there again after every test."""
+    """Python's own handler of Ctrl-C and a handler that records SIGTERM, which are restored after every test."""
     before = {number: signal.getsignal(number) for number in ENDS}
     heard = []
     own = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: lambda number, frame: heard.append(number)}
@@ -210,7 +210,7 @@ def test_once_more(handlers):
 
 
 def test_what_nobody_has_acted_on(handlers):
-    """A signal in the last pass of a loop that is left is handed on to whoever had it before."""
+    """A signal in the last pass of a loop that is left is passed to the previous handler."""
     _, begin = five_steps(False, nothing)
     steps = begin(None)
     next(steps)

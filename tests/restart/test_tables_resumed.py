@@ -44,7 +44,7 @@ def test_table_made_before_the_checkpoint_is_read(kind, folder):
     assert after[: len(before)] == before and len(after) == len(before) + 2
 
 
-def test_damping_goes_on(folder):
+def test_damping_continues(folder):
     """The energy that damping takes is the same bit for bit in a run that is taken up again."""
 
     def run(name, *ends):

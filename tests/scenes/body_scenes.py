@@ -45,7 +45,7 @@ def turned(body, angle):
 
 
 def without(body: Body, hole) -> Body:
-    """A body without the cells whose middles ``hole`` tells, and without nodes that no cell has."""
+    """A body without the cells whose middles ``hole`` selects, and without nodes that no cell has."""
     cells = body.cells[~hole(body.x[body.cells].mean(axis=1))]
     used = np.unique(cells)
     place = np.full(len(body.x), -1)
@@ -88,7 +88,7 @@ def surface_of(s, body):
 
 
 class Bodies:
-    """Some bodies in one mesh, of one modulus unless told, and their displacement."""
+    """Some bodies in one mesh, by default of one modulus, and their displacement."""
 
     def __init__(self, cell, bodies, degree=1, E=None, comm=COMM, law=linear, nu=0.3, **how):
         self.s = scene(comm, cell, bodies, **how)

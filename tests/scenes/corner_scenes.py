@@ -152,7 +152,7 @@ def boundary(s: Scene, body: int, number: int = 1) -> uem.Tag:
 def depth(s: Scene, contact: uem.Contact, body: int) -> float:
     """How deep the deepest contactor is inside a body, of those that are nearest to the target, a length (collective).
 
-    The boundary is cut into straight pieces; how often it goes round a point tells whether this is inside.
+    The boundary is cut into straight pieces; its winding number about a point determines whether this is inside.
     """
     pieces, of_target = _pieces(contact.config, boundary(s, body), contact.target)
     shape, deepest = facet_shape("interval" if pieces.shape[1] == 2 else "triangle", 1), 0.0

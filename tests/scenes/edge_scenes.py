@@ -15,7 +15,7 @@ from body_scenes import without
 from dolfinx import fem
 from dolfinx.mesh import exterior_facet_indices
 from helpers import run
-from restart_scenes import goes_on_alike
+from restart_scenes import continues_alike
 
 import uem_dolfinx as uem
 
@@ -210,7 +210,7 @@ def folded(
     return crossed("hexahedron", [body], [lambda x: ends(x, 0), lambda x: ends(x, 1)], way, R=R, max_penetration=0.5, **how)
 
 
-def goes_on_from_checkpoints(begun, folder):
+def continues_from_checkpoints(begun, folder):
     """Assert that a run of four steps that goes on from a checkpoint ends like one that was left alone.
 
     Args:
@@ -225,4 +225,4 @@ def goes_on_from_checkpoints(begun, folder):
             if step.number == stop:
                 break
     assert r.problem.progress.steps == 4
-    goes_on_alike(r.problem.u.x.array, whole.problem.u.x.array)
+    continues_alike(r.problem.u.x.array, whole.problem.u.x.array)

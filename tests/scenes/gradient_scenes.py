@@ -143,7 +143,7 @@ def orders(s, functional, *names):
     changes = {name: change for name, change in changes.items() if name in (names or changes)}
     controls = [getattr(s, name) for name in changes]
     problem = s.solve()
-    found, told = uem.gradient(problem, functional(problem), controls), {}
+    found, reported = uem.gradient(problem, functional(problem), controls), {}
     for (name, change), control, by in zip(changes.items(), controls, found):
         if name == "X":
             values, slope = s.b.scene.mesh.geometry.x, dot(by, change)
@@ -161,9 +161,9 @@ def orders(s, functional, *names):
                 values[...] = before + h * (change.x.array if isinstance(change, fem.Function) else change)
             return uem.integrate(functional(s.solve()))
 
-        told[name] = uem.taylor_test(at, slope, 1e-3, 2)
+        reported[name] = uem.taylor_test(at, slope, 1e-3, 2)
         values[...] = before
-    return told
+    return reported
 
 
 _BY_NODES = [
@@ -227,8 +227,8 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="n
         with uem.recording(problem) as history:
             for _ in uem.load_steps(problem, steps):
                 now = contact.pair.trial
-                told = np.array([now.active.sum(), (now.active & now.friction.stick).sum()])
-                states.append(comm.allreduce(told).tolist())
+                reported = np.array([now.active.sum(), (now.active & now.friction.stick).sum()])
+                states.append(comm.allreduce(reported).tolist())
         return SimpleNamespace(problem=problem, history=history, contact=contact, states=states)
 
     w = fem.Function(b.V)

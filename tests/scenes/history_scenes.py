@@ -99,19 +99,19 @@ def taylor(s, changes, size=1e-3):
     """
     found = s.solve()
     slope = slope_of(found.history.gradient(found.J, [control for control, _, _ in changes]), changes)
-    values = [told.x.array if isinstance(told, fem.Function) else told.value for _, told, _ in changes]
-    before = [np.array(told) for told in values]
+    values = [reported.x.array if isinstance(reported, fem.Function) else reported.value for _, reported, _ in changes]
+    before = [np.array(reported) for reported in values]
 
     def functional(h):
-        for told, old, (_, _, change) in zip(values, before, changes):
-            told[...] = old + h * (change.x.array if isinstance(change, fem.Function) else change)
+        for reported, old, (_, _, change) in zip(values, before, changes):
+            reported[...] = old + h * (change.x.array if isinstance(change, fem.Function) else change)
         again = s.solve()
         assert again.states == found.states, f"other steps or contactors at {h}: take another scene"
         return uem.integrate(again.J)
 
     order = uem.taylor_test(functional, slope, size, 1)
-    for told, old in zip(values, before):
-        told[...] = old
+    for reported, old in zip(values, before):
+        reported[...] = old
     return order, slope
 
 

@@ -63,7 +63,7 @@ def pressed(bodies, surfaces, led, E, *, swap=False, law=linear, load=None, degr
 
 
 def wedge(slope=0.5, off=0.25, n=8, push=0.1, g=2, **how):
-    """A soft block that comes down on a stiff wedge, whose tip is this part of a facet beside a contactor."""
+    """A soft block that comes down on a stiff wedge, whose tip is this part of a facet from a contactor."""
     cross, m = ([0.0], [2]) if g == 3 else ([], [])
     wide = [c + 1.0 for c in cross]
     tip, deep = off * 2.0 / n, max(1.0, 1.5 * slope)

@@ -21,7 +21,7 @@ def bits(a):
     return np.ascontiguousarray(a).view(np.uint8)
 
 
-def goes_on_alike(own, whole):
+def continues_alike(own, whole):
     """Assert that two runs end alike: to the last bit, on several ranks to rounding, where MUMPS adds what comes in the order it comes in.
 
     Args:

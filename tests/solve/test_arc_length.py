@@ -10,7 +10,7 @@ import pytest
 import ufl
 from dolfinx import fem, mesh
 from helpers import raised
-from restart_scenes import goes_on_alike
+from restart_scenes import continues_alike
 from resting_scenes import COMM
 
 import uem_dolfinx as uem
@@ -80,19 +80,19 @@ class Arch:
 
 def test_a_step_that_fails_after_an_unstable_equilibrium_says_so():
     """The united matrix has a negative eigenvalue between the limit points, where the load falls, and at no stable equilibrium."""
-    arch, h, told = Arch(n=20), 1e-3, []
+    arch, h, reported = Arch(n=20), 1e-3, []
 
     def path():
         for _ in uem.load_steps(arch.problem, 20, arc_length=True):
             slope = (shallow(arch.height() - h) - shallow(arch.height() + h)) / (2 * h)
             if arch.floor.n_active == 0 and abs(slope) > 0.1 * shallow(LIMIT) / RISE:
-                told.append(arch.problem.solver.indefinite)
-                assert told[-1] == (slope < 0.0)
-                if told[-1]:
+                reported.append(arch.problem.solver.indefinite)
+                assert reported[-1] == (slope < 0.0)
+                if reported[-1]:
                     arch.problem.max_iterations = 1
 
     raised(uem.ConvergenceError, r"at the load factor 0\.\d+ the equilibrium was unstable.*take time steps", path)
-    assert False in told and True in told
+    assert False in reported and True in reported
 
 
 def test_arch_snaps_through():
@@ -191,8 +191,8 @@ def test_resumed_on_the_way(tmp_path_factory):
             break
     rest = second.path(5, checkpoint=uem.Checkpoint(folder / "arc.h5", every=1))
     assert 0 < len(rest) <= len(path) - stop
-    goes_on_alike(rest, path[len(path) - len(rest) :])
-    goes_on_alike(second.u.x.array, whole.u.x.array)
+    continues_alike(rest, path[len(path) - len(rest) :])
+    continues_alike(second.u.x.array, whole.u.x.array)
 
 
 def test_path_without_end(monkeypatch):

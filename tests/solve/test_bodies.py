@@ -32,8 +32,8 @@ def test_rounding_of_forces(length):
             F.append(bodies.residual)
         changes.append((F[1] - F[0]).norm())
     bodies.update_tangent()
-    told = bodies.rounding(np.zeros(0, np.int32))
-    assert max(changes) < told < 5 * max(changes)
+    reported = bodies.rounding(np.zeros(0, np.int32))
+    assert max(changes) < reported < 5 * max(changes)
 
 
 @pytest.mark.parametrize("value", [1e-9, 1.0, -7.0e5])
@@ -60,13 +60,13 @@ def test_forces_above_rounding(length):
     bodies.update_tangent()
     body, _ = find_bodies(config)
     upper = config.X[:, 1] > 0.5 * length
-    for strain, told in ((0.0, False), (3e-13, False), (5e-12, True)):
+    for strain, reported in ((0.0, False), (3e-13, False), (5e-12, True)):
         config.displacement[:] = 0.0
         config.displacement[upper] = length * np.array([1.0, 2.0]) * (1.0 + strain * np.sin(config.X[upper] / length))
         b.u.x.scatter_forward()
         bodies.assemble()
-        assert (bodies.above_rounding(False) > 0.0) == told
-    # a soft body's forces are told from its own rounding, not from that of a stiff one
+        assert (bodies.above_rounding(False) > 0.0) == reported
+    # a soft body's forces are distinguished from its own rounding, not from that of a stiff one
     config.displacement[~upper, 1] = 1e-3 * (config.X[~upper, 1] + length)
     b.u.x.scatter_forward()
     bodies.assemble()

@@ -91,7 +91,7 @@ def test_the_order_does_not_depend_on_ranks():
         assert last == [int(np.flatnonzero(some)[along[some].argmin()])]
 
 
-def test_who_goes_in_a_circle_is_named():
+def test_contactors_in_a_cycle_are_named():
     """Contacts and places of the contactors that the last rule has exchanged, three at most and how many more, in one order."""
     X = [(float(i), 0.5) for i in range(6)]
     for frictional, error in ((False, uem.ConvergenceError), (True, uem.FrictionError)):
@@ -112,7 +112,7 @@ def test_who_goes_in_a_circle_is_named():
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [0, exchanges_of_a_step.MOST_OF_EACH])
 def test_the_first_alone_finds_any_active_set(most, monkeypatch):
-    """Exchanged one by one in their order, however many these are, contactors end where all at once do; a bound is told of."""
+    """Exchanged one by one in their order, however many these are, contactors end where all at once do; reaching a bound is an error."""
     ends = []
     for rule in (None, Rule.FIRST):
         if rule is not None:
@@ -296,10 +296,10 @@ def test_scenes_that_went_in_circles(make, how, most):
 def test_a_stiff_block_is_dragged_over_a_soft_one_and_back(cell, n, ratio, mu, coupling):
     """The contactor is the stiffer by so much: no more than eight iterations and 100 exchanges a step, and Coulomb's law at the end."""
     d = driven(cell, mu, law=st_venant, E=(1.0, ratio), n=n, how={"coupling": coupling})
-    beside = [0.0] * (d.blocks.gdim - 2)
+    sideways = [0.0] * (d.blocks.gdim - 2)
     ways = [(0.03 * k, -0.02) for k in range(5)] + [(0.12 - 0.03 * k, -0.03) for k in range(1, 5)]
     for way, depth in ways:
-        history = d.to(way, *beside, depth)
+        history = d.to(way, *sideways, depth)
         assert len(history) - 1 <= 8 and sum(i.exchanges for i in history) <= 100
     force = d.contact.resultant().force
     assert abs(force[0]) <= mu * abs(force[-1]) * (1 + 1e-6)

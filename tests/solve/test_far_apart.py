@@ -37,7 +37,7 @@ def always_looking(monkeypatch):
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize("degree", [1, 2])
 def test_what_is_far_apart(cell, degree):
-    """Surfaces are far apart beyond the longest facet of the target; their gap is told all the same."""
+    """Surfaces are far apart beyond the longest facet of the target; their gap is known all the same."""
     g = 2 if cell == "triangle" else 3
     longest = 0.5 * np.sqrt(g - 1)
     for part, apart in ((0.5, False), (1.5, True)):
@@ -46,8 +46,8 @@ def test_what_is_far_apart(cell, degree):
         problem.solve()
         assert far(problem) == [apart]
         (contact,) = problem.contacts
-        told = contact.gap.x.array[contact.gap.x.array > 0]
-        assert COMM.allreduce(len(told)) > 0 and highest(COMM, np.abs(told - gap)) <= 1e-14
+        reported = contact.gap.x.array[contact.gap.x.array > 0]
+        assert COMM.allreduce(len(reported)) > 0 and highest(COMM, np.abs(reported - gap)) <= 1e-14
 
 
 def test_rigid_surfaces_are_far_by_their_distance():
@@ -114,9 +114,9 @@ def test_a_fall_onto_what_is_far_away(monkeypatch):
         f.weigh(0.0, 1e-3, 0.0)
         tag = f.s.tag
         falling, below = tag("falling", 1, at(1, 10.0)), tag("below", 0, at(1, 0.0))
-        side, beside = tag("side", 1, at(0, 0.9)), tag("beside", 2, at(0, 4.0))
+        side, next_to = tag("side", 1, at(0, 0.9)), tag("beside", 2, at(0, 4.0))
         bcs = [bc for body, y in ((0, -1.0), (2, 4.0)) for c in range(2) for bc in clamp(f.V, tag("foot", body, at(1, y)), c)]
-        problem = f.problem(bcs, [uem.Contact(falling, below), uem.Contact(side, beside)])
+        problem = f.problem(bcs, [uem.Contact(falling, below), uem.Contact(side, next_to)])
         (step,) = run(problem)
         found.append((f.moved(), step.newton_iterations))
         assert problem.contacts[0].resultant().force[1] == pytest.approx(0.8e-3, rel=1e-9)
@@ -138,19 +138,19 @@ numbers = some.lists(some.floats(-3, 3), min_size=12, max_size=12)
 
 @given(numbers, some.lists(some.floats(0.0, 1.0), min_size=2, max_size=2))
 def test_no_way_is_nearer_than_the_bound(numbers, at):
-    """Points of two boxes, and of a box and a circle about the origin, are nowhere nearer on straight ways than what is told."""
+    """Points of two boxes, and of a box and a circle about the origin, are nowhere nearer on straight paths than the returned distance."""
     x = np.array(numbers).reshape(2, 3, 2)  # before and after: two contactors, one target node
     t, a = at
     low, high = x[:, :2].min(axis=1), x[:, :2].max(axis=1)
-    told = []
+    reported = []
     for k in range(2):
         between = np.concatenate([x[k, 2] - high[k], low[k] - x[k, 2]])[None]
         middle = 0.5 * (low[k] + high[k])
         radius = 0.5 * np.linalg.norm(high[k] - low[k])
-        told.append(Boxes(between, middle[None], np.array([radius]), np.array([np.linalg.norm(middle) - 1.0])))
-    meshed, rigid = told[0].apart_until(told[1])
+        reported.append(Boxes(between, middle[None], np.array([radius]), np.array([np.linalg.norm(middle) - 1.0])))
+    meshed, rigid = reported[0].apart_until(reported[1])
     contactor = (1 - t) * (x[0, 0] + a * (x[0, 1] - x[0, 0])) + t * (x[1, 0] + a * (x[1, 1] - x[1, 0]))
     target = (1 - t) * x[0, 2] + t * x[1, 2]
     assert np.linalg.norm(contactor - target) >= meshed - 1e-12
     assert np.linalg.norm(contactor) - 1.0 >= rigid - 1e-12
-    assert (told[0].apart <= [np.linalg.norm(x[0, 0] - x[0, 2]) + 1e-12, np.linalg.norm(x[0, 0]) - 1.0 + 1e-12]).all()
+    assert (reported[0].apart <= [np.linalg.norm(x[0, 0] - x[0, 2]) + 1e-12, np.linalg.norm(x[0, 0]) - 1.0 + 1e-12]).all()

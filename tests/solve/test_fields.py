@@ -201,7 +201,7 @@ def test_a_field_that_changes_in_equilibrium(unit):
 
 
 def test_every_field_is_solved_beside_the_largest_forces():
-    """Heat that depends on its temperature is in balance to the accuracy asked for, beside forces 1e12 times as large."""
+    """Heat that depends on its temperature is in balance to the required accuracy, with forces 1e12 times as large."""
     b = blocks(COMM, "triangle", 3, 3)
     f = fields(b, 1, 1)
     (u, T), (v, q) = f.split(f.w), f.split(ufl.TestFunction(f.w.function_space))
@@ -226,7 +226,7 @@ def test_every_field_is_solved_beside_the_largest_forces():
     [(neo_hooke_with_pressure, 2e11, True), (with_pressure, 1.0, True), (neo_hooke_with_pressure, 1.0, False)],
 )
 def test_unloaded_to_nothing(law, E, contact):
-    """Without any force left, what remains in each field is rounding beside what there has been in it, which ends the step."""
+    """Without any force left, what remains in each field is rounding of what there has been in it, which ends the step."""
     b = blocks(COMM, "triangle", 2, 3)
     f, load = fields(b, 2, 1), fem.Constant(b.scene.mesh, 0.0)
     v = f.split(ufl.TestFunction(f.w.function_space))[0]
@@ -260,7 +260,7 @@ def test_other_fields_do_not_hide_that_there_is_no_stiffness():
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_a_block_that_contact_alone_holds(coupling):
-    """It falls, and comes to rest with its weight on the other, both of them with a pressure, a temperature and a vector beside."""
+    """It falls, and comes to rest with its weight on the other, both of them with a pressure, a temperature and a vector in addition."""
     b = blocks(COMM, "triangle", 3, 3, gap=0.1)
     f = fields(b, 2, 1, 1, ("Lagrange", 1, (2,)), displacement=1)
     parts, tests = f.split(f.w), f.split(ufl.TestFunction(f.w.function_space))
@@ -381,7 +381,7 @@ def test_page_on_several_fields():
     page = (Path(__file__).parents[2] / "demos" / "site" / "howto" / "several_fields.md").read_text(encoding="utf-8")
     known = {}
     exec(compile(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[1], "several_fields.md", "exec"), known)
-    told = known["pressures"]
-    assert len(told) == 4 and told[0][0] == 0.0 < told[-1][0]
-    for wanted, pressures in told:
-        assert highest(COMM, np.abs(pressures - wanted)) < 1e-9 * told[-1][0]
+    reported = known["pressures"]
+    assert len(reported) == 4 and reported[0][0] == 0.0 < reported[-1][0]
+    for wanted, pressures in reported:
+        assert highest(COMM, np.abs(pressures - wanted)) < 1e-9 * reported[-1][0]

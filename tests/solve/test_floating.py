@@ -202,7 +202,7 @@ def test_middle_block_between_two(cell):
 
 
 def dropped(comm=COMM, angle=0.0, length=1.0, E=1.0, law="finite", shuffle=None):
-    """A half disc, drawn askew, that drops into a groove beside its bottom; the answer in the drawing's frame and units."""
+    """A half disc, drawn askew, that drops into a groove next to its bottom; the answer in the drawing's frame and units."""
     R, middle = rotation(2, angle), np.array([0.05, 1.4])
     tilt = rotation(2, 0.1)
 
@@ -313,7 +313,7 @@ def test_target_missed_sideways(law):
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_sliding_down_a_slope(cell):
-    """A rigid slope without friction lets a body go on for ever: the message tells which way."""
+    """A rigid slope without friction lets a body slide without end: the message has the direction."""
     g, slope = (2 if cell == "quadrilateral" else 3), 0.5
     n = rotation(g, -slope)[:, -1]
     f = Falling(cell, [box(cell, [0.0] * g, [1.0] * g, [2] * g)], "finite", E=(1.0,), pose=lambda x: x @ rotation(g, -slope).T)

@@ -89,7 +89,7 @@ def in_the_body(s, path):
     for step in uem.load_steps(problem, 4):
         if step.factor == 0.75:
             problem.solve()
-            s.asked = uem.gradient(problem, s.J, [s.control(name) for name in s.names])
+            s.requested = uem.gradient(problem, s.J, [s.control(name) for name in s.names])
             break
     return problem
 
@@ -175,11 +175,11 @@ WAYS = {
 def test_shares(way, size, tmp_path):
     """``J(h) - J(0) - h J'`` vanishes with h^2, J computed anew by all steps, for all that is led, and for what is not."""
     s, names = Led(size), WAYS[way]
-    s.names, s.factor, s.asked, s.history = names, None, None, None
+    s.names, s.factor, s.requested, s.history = names, None, None, None
     path = COMM.bcast(tmp_path) / "run"
     problem, scale = way(s, path), size**4
     controls = [s.control(name) for name in names]
-    found, told = s.asked or uem.gradient(problem, s.J, controls), {}
+    found, reported = s.requested or uem.gradient(problem, s.J, controls), {}
     if s.history is not None:
         for now, before in zip(found, s.history.gradient(s.J, controls)):
             values = [np.asarray(one.x.array if isinstance(one, fem.Function) else one) for one in (now, before)]
@@ -190,7 +190,7 @@ def test_shares(way, size, tmp_path):
         slope = dot(by, change) if name == "sides" else float(by) * size_of
         # forwards as backwards
         pair = (controls[names.index(name)], change if name == "sides" else size_of)
-        if s.asked is None and name != "by_function":
+        if s.requested is None and name != "by_function":
             problem = way(s, path)
             pair = (s.control(name), pair[1])
             du = uem.tangent(problem, [pair])
@@ -206,8 +206,8 @@ def test_shares(way, size, tmp_path):
             s.sides.x.array[:], s.values[name] = before, kept
             return uem.integrate(s.J) / scale
 
-        told[name] = uem.taylor_test(functional, slope / scale, 2e-3, 1)
-    assert min(told.values()) >= 1.9, told
+        reported[name] = uem.taylor_test(functional, slope / scale, 2e-3, 1)
+    assert min(reported.values()) >= 1.9, reported
 
 
 def test_from_where_nodes_were_free():
@@ -226,7 +226,7 @@ def test_from_where_nodes_were_free():
 
 
 def test_values_that_have_changed_within_steps():
-    """A value on its way that has changed since the step is told, too, and a Constant that was set by hand is what it is."""
+    """A value on its way that has changed since the step is reported, too, and a Constant that was set by hand is what it is."""
     s = Led()
     problem = s.problem(s.load())
     until(uem.load_steps(problem, 4), 0.5)

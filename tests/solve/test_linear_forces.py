@@ -54,7 +54,7 @@ def test_momentum_of_translated_bodies(foundation):
     "foundation, cell, degree", [(0.0, "triangle", 1), (0.0, "triangle", 2), (0.0, "quadrilateral", 1), (1e-9, "triangle", 1)]
 )
 def test_what_resists_a_translation(foundation, cell, degree):
-    """Rounding of K does not resist a translation; the weakest foundation that is told from it does, with its stiffness."""
+    """Rounding of K does not resist a translation; the weakest foundation that differs from it does, with its stiffness."""
     problem = flying(foundation, cell, degree)
     found = resistance_to_translation(problem.bodies.update_tangent(), problem.config.unknowns)
     total = np.sum(COMM.allgather(found.sum(axis=0)), axis=0)

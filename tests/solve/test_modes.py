@@ -12,7 +12,7 @@ import ufl
 from body_scenes import of_quarters
 from dolfinx import fem, mesh
 from helpers import at, blocks, box, clamp, linear, modulus, refused, run, scene
-from restart_scenes import goes_on_alike
+from restart_scenes import continues_alike
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat
@@ -133,7 +133,7 @@ def test_in_dynamics():
             if ask:
                 assert uem.modes(problem, 1).frequencies[0] == pytest.approx(discrete(np.pi / 8, 0.5), rel=1e-9)
         ends.append(np.array(u.x.array))
-    goes_on_alike(*ends)
+    continues_alike(*ends)
 
 
 def test_refused(monkeypatch):

@@ -226,7 +226,7 @@ def test_line_search_shortens_a_step_and_ends_in_the_same_state():
 
 
 def test_failure_restores_the_committed_state():
-    """After a failed step everything is as before it, and the history tells what happened."""
+    """After a failed step everything is as before it, and the history has all iterations."""
     b, contact, problem = pressed(rtol=1e-10, load=None)
     steps = uem.load_steps(problem, 2)
     next(steps)

@@ -147,28 +147,28 @@ def test_a_residual_that_comes_back_is_waited_for(largest):
 
 
 def test_exchanges_are_settled_by_loose_solves():
-    """Who is wrong is asked of loose solutions, each begun where the last one ended; the last is as accurate as convergence asks for."""
-    system, asked = OneUnknown(0.5), []
+    """Contactors in a wrong state are found by loose solves, each from the last solution; the last solve is as accurate as required."""
+    system, requested = OneUnknown(0.5), []
     system.exact, system.iterative, system.in_contact, system.active_sets = False, True, True, 1
-    system.F = lambda: 1.0 if len(asked) < 4 else 0.0
+    system.F = lambda: 1.0 if len(requested) < 4 else 0.0
 
     def answer(rhs, accuracy, near):
-        asked.append((accuracy, None if near is None else near.array_r[0]))
-        return float(len(asked))
+        requested.append((accuracy, None if near is None else near.array_r[0]))
+        return float(len(requested))
 
     system.answer = answer
     history = system.loop(line_search=False)
     # the first may not be the last: contact has yet to be met
-    assert asked[:2] == [(FORCING, None), (FORCING, 10.0)]
-    assert asked[2] == (FORCING, None) and asked[3] == (pytest.approx(1e-9), 3.0)
+    assert requested[:2] == [(FORCING, None), (FORCING, 10.0)]
+    assert requested[2] == (FORCING, None) and requested[3] == (pytest.approx(1e-9), 3.0)
     assert [(i.exchanges, i.linear_iterations) for i in history] == [(1, 2), (0, 2), (0, 0)]
 
 
 def test_solves_on_the_way_leave_the_more_the_less_is_known():
-    """Where tangents change a solve leaves a part of the right-hand side that falls with the residual, and no less than is asked for."""
-    system, asked = OneUnknown(0.5), []
+    """Where tangents change a solve leaves a part of the right-hand side that falls with the residual, and no less than is required."""
+    system, requested = OneUnknown(0.5), []
     system.exact, system.passing = False, True
-    system.F = lambda: (1.0, 1e-2, 1e-5, 1e-9)[len(asked)]
-    system.answer = lambda rhs, accuracy, near: asked.append(accuracy) or 1.0
+    system.F = lambda: (1.0, 1e-2, 1e-5, 1e-9)[len(requested)]
+    system.answer = lambda rhs, accuracy, near: requested.append(accuracy) or 1.0
     system.loop(line_search=False)
-    assert asked == pytest.approx([FORCING, 1e-2 * FORCING, 0.1 * 1e-8 / 1e-5])
+    assert requested == pytest.approx([FORCING, 1e-2 * FORCING, 0.1 * 1e-8 / 1e-5])

@@ -110,7 +110,7 @@ WRAPPED = [
 
 @pytest.mark.parametrize("how", [*WRAPPED[:4], *(pytest.param(how, marks=pytest.mark.slow) for how in WRAPPED[4:])], ids=str)
 def test_a_plate_wraps_the_right_faces(how):
-    """Nodes of the plate that come from beside the block's edge end on the faces that small steps bring them to."""
+    """Nodes of the plate that come from the side of the block's edge end on the faces that small steps bring them to."""
     forces = []
     for steps in (1, 20):
         problem, contact = plate_and_block(contactor="plate", **how)

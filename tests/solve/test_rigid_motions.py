@@ -77,7 +77,7 @@ def test_what_counts_as_loaded(body):
 
 
 def test_rates_of_bodies_that_have_moved():
-    """A square that turns finitely about the middle where it is now, not where it was asked before: its own middle rests."""
+    """A square that turns finitely about the middle where it is now, not where it was before: its own middle rests."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [2.0, 2.0], [2, 2])])
     u = fem.Function(compat.function_space(s.mesh, 1, (2,)))
     config = uem.UnitedProblem(linear(u, 1.0), u).config

@@ -67,13 +67,13 @@ def test_the_solution_is_that_of_the_constrained_matrix(name, monkeypatch):
     def solve(system, problem, accuracy, near):
         step, state, solver = own(system, problem, accuracy, near), problem.state, system.solver
         if state.solved is not None and solver.tells_sign | (state.trial is state.test) and not solver.iterative:
-            told, kept = solver.negative, solver.take
+            reported, kept = solver.negative, solver.take
             matrix = state.trial, system.bodies.tangent.K, together(system.curvature, state.added)
             solver.set_operator(*matrix, state.test)
             solver.begin_at(state.trial.c)
             dq = solver.complete(solver.solve(problem.rhs)[0])
             compared.append((dq - step.dq).norm() / max(dq.norm(), 1e-7))
-            assert solver.negative == told
+            assert solver.negative == reported
             kept(state.solved, *matrix, state.test)
         return step
 

@@ -93,7 +93,7 @@ def test_at_once():
         assert column.forces()[0] == pytest.approx(0.5 * M * 0.02 * step.factor if step.step == "press" else 0.03, abs=1e-12)
 
 
-def test_a_step_that_is_left_goes_on_with_what_is_left():
+def test_a_step_that_is_left_continues_with_what_is_left():
     """Left at a third of the release, the next step releases the other two thirds."""
     column, pressed = Column(), 0.5 * M * 0.02
     press, *_ = column.steps()

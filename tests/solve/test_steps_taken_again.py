@@ -68,7 +68,7 @@ class Warm:
         )
 
     def state(self):
-        """All that the next step begins with, and what is told of the last."""
+        """All that the next step begins with, and the results of the last."""
         pair, history = self.contact.pair, [f for law in self.laws for f in law.history.values()]
         arrays = [self.b.u.x.array, pair.committed.lam, pair.committed.force, *(f.x.array for f in history)]
         f = pair.committed.friction
@@ -171,7 +171,7 @@ def work_of(plastic):
 
 
 def test_page_on_staggered_problems():
-    """Its script runs as it stands there, to the root of the equation that it tells."""
+    """Its script runs as it stands there, to the root of the equation in it."""
     page = (Path(__file__).parents[2] / "demos" / "site" / "howto" / "staggered.md").read_text(encoding="utf-8")
     known = {}
     exec(compile(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[1], "staggered.md", "exec"), known)

@@ -138,8 +138,10 @@ def test_a_scalar_field_that_nothing_holds(coupling, options):
     F = ufl.inner(ufl.grad(T), ufl.grad(q)) * ufl.dx - 1.0 * q * ufl.dx
     problem = uem.UnitedProblem(F, T, contacts=[tie], petsc_options=options)
     # rounding decides whether a solver meets the singular matrix, which is an error before the field has grown
-    told = "nothing holds the .* 'temperature' on the body with its middle at|is singular: hold bodies|a body may be free to move"
-    with pytest.raises((uem.FloatingBodyError, uem.LinearSolveError), match=told):
+    reported = (
+        "nothing holds the .* 'temperature' on the body with its middle at|is singular: hold bodies|a body may be free to move"
+    )
+    with pytest.raises((uem.FloatingBodyError, uem.LinearSolveError), match=reported):
         problem.solve()
     assert not T.x.array.any()
 
@@ -201,7 +203,7 @@ def test_a_held_body_that_is_left_out_of_the_residual(cell, coupling, options):
 @pytest.mark.parametrize("options", [None, CG])
 @pytest.mark.parametrize("how", ["alone", "contact", "tied", "free"])
 def test_a_body_that_is_left_out_of_the_residual(how, options):
-    """Held at some of its nodes or none: nothing resists the others, which is told."""
+    """Held at some of its nodes or none: nothing resists the others, which is reported."""
     p = Pressed("triangle", 2)
     contacts = [] if how == "alone" else [p.contact(tied=how == "tied")]
     bcs = [] if how == "free" else [uem.dirichlet(p.V, p.b.bottom)]
@@ -212,7 +214,7 @@ def test_a_body_that_is_left_out_of_the_residual(how, options):
 @pytest.mark.parametrize("rotations", ["small", "large"])
 @pytest.mark.parametrize("force", [0.0, 0.01, -0.01])
 def test_a_free_rigid_body_without_stiffness(rotations, force):
-    """It is pressed on the block, stays where it is, or is pulled away, and that is told."""
+    """It is pressed on the block, stays where it is, or is pulled away, and that is reported."""
     p = Pressed("quadrilateral")
     contact = p.contact()
     rigid = uem.RigidCoupling(p.tool, (0.5, -0.5), rotations=rotations, force=(0.0, force))
@@ -226,7 +228,7 @@ def test_a_free_rigid_body_without_stiffness(rotations, force):
 
 
 def test_conditions_of_a_body_without_stiffness_change():
-    """What holds it in one step is gone in the next one: that is told."""
+    """What holds it in one step is gone in the next one: that is reported."""
     p = Pressed("triangle")
     problem = p.problem([uem.dirichlet(p.V, p.tool)])
     steps = [uem.Step("held"), uem.Step("loose", bcs=p.down)]

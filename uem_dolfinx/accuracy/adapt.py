@@ -53,12 +53,12 @@ def carry_over(before: UnitedProblem, after: UnitedProblem) -> None:
     within = np.full(len(points), reduced(comm, cells.width, op=MPI.MAX))
     boxes = RankBoxes(comm, cells.centres, kind=of_cells, n_kinds=count)
     exchange = Exchange(comm, boxes.near(points, within, kind=of_points))
-    asked, kind = exchange.send(points, of_points)
-    distance, values = np.full(len(asked), np.inf), np.zeros((len(asked), g))
+    received, kind = exchange.send(points, of_points)
+    distance, values = np.full(len(received), np.inf), np.zeros((len(received), g))
     for k in range(count):
         rows, here = np.flatnonzero(kind == k), np.flatnonzero(of_cells == k)
         if len(rows) and len(here):
-            distance[rows], values[rows] = cells.at(asked[rows], here)
+            distance[rows], values[rows] = cells.at(received[rows], here)
     distance, values = exchange.back(distance, values)
     order = np.lexsort((distance, exchange.rows))
     row, first = np.unique(exchange.rows[order], return_index=True)
@@ -193,10 +193,10 @@ def adapt(
         make: returns the problem, made from the size of cells: ``size`` is for ``read_gmsh(..., size=size)``, None on the first mesh.
             Curves and surfaces that the ``.geo`` file makes transfinite keep their cells.
         tolerance: bound on the estimated error over the displacement, in the energy norm; 0.05 is 5 %.
-        cells: or the number of cells, which are spent where they serve most.
+        cells: or the number of cells, whose sizes then follow the error.
         goal: returns a functional of a problem's displacement, of which the error over its value is estimated instead, see ``goal_error``.
-            Its parts of all cells, without their signs, are at most ``MOST_CANCELLED`` times the tolerance on the last mesh.
-        by: what the error in the energy norm is estimated by, see ``error_estimate``.
+            The sum of its parts of all cells, without their signs, is at most ``MOST_CANCELLED`` times the tolerance on the last mesh.
+        by: method that estimates the error in the energy norm, see ``error_estimate``.
         solve: solves a problem, e.g. ``lambda problem: list(uem.load_steps(problem, 10))``; by default in one load step.
         solve_again: solves the problem of every mesh after the first, which begins with the displacement of the mesh before,
             e.g. ``lambda problem: problem.solve()``, at the full load at once. The solution must not depend on the path; where it
@@ -207,9 +207,9 @@ def adapt(
         The last problem, its estimate, and a line for each mesh.
 
     Raises:
-        InputError, InputTypeError: for wrong arguments, neither or both of ``tolerance`` and ``cells``, what ``error_estimate`` refuses,
-            or ``solve_again`` with laws that have a history, friction or cohesion.
-        InputError: if the goal is zero on a mesh, e.g. a force on what nothing touches, so that no error can be over it.
+        InputError, InputTypeError: for wrong arguments, neither or both of ``tolerance`` and ``cells``, problems that ``error_estimate``
+            refuses, or ``solve_again`` with laws that have a history, friction or cohesion.
+        InputError: if the goal is zero on a mesh, e.g. the force on a surface without contact, so that it has no relative error.
         MeshError: if the cells do not follow the sizes, since the geometry fixes them.
 
     Example:

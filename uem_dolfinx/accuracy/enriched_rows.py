@@ -2,7 +2,7 @@
 
     integral of phi_i (n . (w_c - w_t) + g) >= 0          for each contactor i, and zero for an active one
 
-w_c and w_t are values of a function w of that space on the contactor and at the closest point of the target. g is the gap that the
+w_c and w_t are values of a function w of that space on the contactor and at the closest point of the target. The gap g is the one that the
 solution leaves, and phi_i a Bernstein function of that space on the contactor. Both couplings and rigid targets get the
 same conditions; ties have one for each component, and so have contactors that stick. Where contactors slip, their friction is part of the
 equation's forces, along ``n - mu s`` instead of n, with the coefficient mu and the direction of slip s.

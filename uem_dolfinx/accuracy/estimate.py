@@ -41,7 +41,7 @@ class ErrorEstimate:
         of_bodies: estimate of each body ``(n_bodies,)``, in the order in which their cells come in the mesh's input.
         cells: estimate of each cell, a Function that is constant in cells, for files and pictures.
         shares: squared estimates of this rank's cells ``(n_owned_cells,)``.
-        narrow: contacts of fewer than ``FEWEST`` facets along each direction: wider cells see a part of the error alone.
+        narrow: contacts of fewer than ``FEWEST`` facets along each direction, where the estimate is only a part of the error.
     """
 
     total: float
@@ -58,7 +58,7 @@ class ErrorEstimate:
 
     @property
     def at_most(self) -> float:
-        """What a tolerance bounds: ``relative``, or ``UNRESOLVED`` times as much where few facets are in contact."""
+        """The value that a tolerance bounds: ``relative``, or ``UNRESOLVED`` times as much where few facets are in contact."""
         return self.relative * (UNRESOLVED if self.narrow else 1.0)
 
     def __str__(self) -> str:
@@ -148,7 +148,7 @@ def refuse_estimate(problem: UnitedProblem, by: By = "residual") -> None:
 
 @dataclass
 class ErrorLimit:
-    """Warns where the estimated error of a load step, by the mesh, comes to exceed a bound, with the place of the largest share.
+    """Warns when the estimated mesh error of a load step first exceeds a bound, with the position of the largest share.
 
     Args:
         bound: on the estimate over the displacement, in the energy norm; 0.05 is 5 %.

@@ -51,7 +51,7 @@ class GoalError:
 
     Attributes:
         value: of the functional.
-        error: estimate of the exact value less this one.
+        error: estimate of the exact value minus this one.
         rounding: part of the value that the tolerance of equilibrium leaves open.
         parts: sum of the parts of all cells, in which errors of opposite signs do not cancel.
         cells: part of each cell, without sign, a Function that is constant in cells, for files and pictures.
@@ -90,8 +90,8 @@ def goal_error(problem: UnitedProblem, J: ufl.Form) -> GoalError:
         The value, the estimate, and the parts of the cells.
 
     Raises:
-        InputError, InputTypeError: for what ``error_estimate`` refuses, friction other than Coulomb's, histories, couplings and general
-            contact.
+        InputError, InputTypeError: for problems that ``error_estimate`` refuses, friction other than Coulomb's, histories, couplings and
+            general contact.
         MissingBackendError: if PETSc has neither MUMPS nor SuperLU_DIST.
 
     Example:

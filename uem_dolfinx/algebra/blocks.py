@@ -97,8 +97,8 @@ def places_of(A: Blocks, rows: Ints) -> tuple[Ints, Ints]:
 def rows_at(space: Nodes, A: Blocks, nodes: Ints) -> Blocks:
     """Rows of A, stored on their owners, at distinct global ``nodes (m,)`` of any rank (collective)."""
     asking = Exchange.to(space.comm, space.owner_of(nodes))
-    (asked,) = asking.send(nodes)
-    places, counts = places_of(A, asked)
+    (received,) = asking.send(nodes)
+    places, counts = places_of(A, received)
     ranks = np.repeat(asking.origins, counts)
     lists = np.split(places, np.searchsorted(ranks, np.arange(1, space.comm.size)))
     return Blocks(*Exchange(space.comm, lists).send(*A))

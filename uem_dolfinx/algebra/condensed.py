@@ -62,9 +62,9 @@ class Condensed(Returning):
         self._expected: tuple[PETSc.Mat, mumps.Cost] | None = None
         self.drop()
 
-    made, stays = "_pc", ("beside",)
+    made, stays = "_pc", ("adjacent_nodes",)
     #: Mask of owned nodes ``(n_owned,)`` that may be followed next, from the mask of followed nodes ``(n_owned,)`` (collective), or None.
-    beside: Callable[[Bools], Bools] | None = None
+    adjacent_nodes: Callable[[Bools], Bools] | None = None
 
     def drop(self) -> None:
         """Forget K (collective)."""
@@ -102,8 +102,8 @@ class Condensed(Returning):
         if self._is_of(K):
             followed = self._followed(P, Q, holding=not self._begins)
             touched = self._touched(P, Q, G, followed, holding=not self._begins)
-            if self._begins and self._wide and self.beside is not None:
-                touched |= self.beside(followed)
+            if self._begins and self._wide and self.adjacent_nodes is not None:
+                touched |= self.adjacent_nodes(followed)
             lacks = bool((touched & ~self._nodes).any() or (self._begins and (self._nodes & ~touched).any()))
         return not reduced(self.space.comm, int(lacks))
 
@@ -145,9 +145,9 @@ class Condensed(Returning):
         self._known = known
         if not self._is_cheaper(nodes, K, pc):
             return False
-        if self.beside is not None:
+        if self.adjacent_nodes is not None:
             # closest points that move to adjacent facets then need no new factorisation
-            wide = nodes | self.beside(followed)
+            wide = nodes | self.adjacent_nodes(followed)
             self._wide = self._is_cheaper(wide, K, pc)
             nodes = wide if self._wide else nodes
         self._nodes = nodes
@@ -186,13 +186,13 @@ class Condensed(Returning):
         S must then not have more entries than these factors, either.
         """
         size = reduced(self.space.comm, self.space.block * int(nodes.sum()))
-        dense, beside = size**3 / 3 * (1 if pc.getType() == "cholesky" else 2), FOR_EACH_UNKNOWN * K.getSize()[0]
-        if dense <= beside:
+        dense, solves = size**3 / 3 * (1 if pc.getType() == "cholesky" else 2), FOR_EACH_UNKNOWN * K.getSize()[0]
+        if dense <= solves:
             return True
         if self._expected is None or self._expected[0] != K:
             self._expected = K, mumps.expected(pc, K)
         flops, entries = self._expected[1]
-        return dense <= flops + beside and size**2 <= entries
+        return dense <= flops + solves and size**2 <= entries
 
     def unite(self, P: Restriction, Q: Restriction, G: PETSc.Mat | None) -> None:
         """Make the dense constrained matrix; ``serves`` must be true (collective)."""
@@ -277,11 +277,11 @@ class Condensed(Returning):
         self._known = (du.copy(), forces.copy()) if exact else None
         return forces
 
-    def complete(self, dq: PETSc.Vec, asked: Sequence[Indices] | None = None) -> PETSc.Vec:
-        """Unknowns dq of the last solve, on I as well; if owned nodes are given as ``asked``, only if one is not in C (collective)."""
+    def complete(self, dq: PETSc.Vec, needed: Sequence[Indices] | None = None) -> PETSc.Vec:
+        """Unknowns dq of the last solve, on I as well; if owned nodes are given as ``needed``, only if one is not in C (collective)."""
         if self.whole:
             return dq
-        if asked is not None and not reduced(self.space.comm, int(any(not self._nodes[nodes].all() for nodes in asked))):
+        if needed is not None and not reduced(self.space.comm, int(any(not self._nodes[nodes].all() for nodes in needed))):
             return dq
         assert self._known is not None
         (P, _, K, _), at = self.made_of, self._at

@@ -363,12 +363,12 @@ def _pivots(A: Array, h: Array, across: Array, free: Bools, rest: Bools, rank: I
         i = int(np.argmax(np.where(among, largest, -1.0)))
         t, rest[i] = int(where[i]), False
         # chosen and dropped rows are not updated any more
-        q, asked = across[i] / left[i], np.flatnonzero(rest)
+        q, coupled = across[i] / left[i], np.flatnonzero(rest)
         filled = np.flatnonzero(q)
-        along = across[asked[:, None], filled] @ q[filled]
-        asked, along = asked[along != 0], along[along != 0]
-        across[asked[:, None], filled] -= along[:, None] * q[filled]
-        left[asked] = np.linalg.norm(across[asked], axis=1)
+        along = across[coupled[:, None], filled] @ q[filled]
+        coupled, along = coupled[along != 0], along[along != 0]
+        across[coupled[:, None], filled] -= along[:, None] * q[filled]
+        left[coupled] = np.linalg.norm(across[coupled], axis=1)
         d = A[i, t] * free[t]
         d /= (pushed := np.linalg.norm(d))
         A[i], h[i] = A[i] / pushed, h[i] / pushed

@@ -85,7 +85,7 @@ OF_CHANGES = 4.0
 #: A factorisation serves for bodies whose stiffness has changed by no more than this part anywhere.
 #: [convention; diagonal of K; test_kept_factor.py::test_a_factor_serves_few_changes]
 ALIKE = 0.02
-#: Solves leave no more than this part of their right-hand side, however little is asked for: another digit is cheaper than another
+#: Solves leave no more than this part of their right-hand side, however loose the tolerance is: another digit is cheaper than another
 #: Newton iteration. [convention; right-hand side; test_kept_factor.py::test_a_factor_leaves_little]
 LEAST_ACCURATE = 1e-3
 

@@ -386,9 +386,9 @@ class UnitedSolver(KspOfOptions):
         """Set the increment to which the next solves add ``P dq``, to be completed, and the norm below which forces are rounding."""
         self.condensed.begin_at(c, rounding)
 
-    def complete(self, dq: PETSc.Vec, asked: Any = None) -> PETSc.Vec:
-        """All unknowns of the last solve; with nodes ``asked``, completed only if one of these is missing (collective)."""
-        return self.condensed.complete(dq, asked) if self._on_condensed else dq
+    def complete(self, dq: PETSc.Vec, needed: Any = None) -> PETSc.Vec:
+        """All unknowns of the last solve; with nodes ``needed``, completed only if one of these is missing (collective)."""
+        return self.condensed.complete(dq, needed) if self._on_condensed else dq
 
     def _iterate(self, rhs: PETSc.Vec, dq: PETSc.Vec) -> bool:
         """Solve by the KSP from ``dq``; whether an earlier preconditioner takes too many iterations for that (collective)."""

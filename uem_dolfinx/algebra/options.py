@@ -26,8 +26,8 @@ FEW_ITERATIONS = 200
 #: A matrix that CG or GMRES does not solve is factorised up to so many unknowns, by dimension: its LU factors take some 8 GiB.
 #: [bound; unknowns; test_options.py::test_factorised_at_need]
 FACTORISED_UP_TO = {2: 3_000_000, 3: 200_000}
-#: GMRES stagnates where many contactors slip if it forgets what it has found: after so many vectors, which take no more memory than a
-#: matrix in 3D, it does, or leaves the matrix to a factorisation that pays.
+#: GMRES stagnates where many contactors slip if it restarts too early. It restarts after so many vectors, which take no more memory
+#: than a matrix in 3D, or leaves the matrix to a factorisation if that is cheaper.
 #: [bound; iterations; test_linear_solver.py::test_gmres_gives_way]
 GMRES_RESTART = 100
 #: Error codes of PETSc for an unknown type or factorisation.

@@ -203,8 +203,8 @@ class UnitedMatrix(Returning):
     def _crossed_out(self, G: PETSc.Mat, free: Bools) -> Blocks:
         """Blocks of G in owned rows without prescribed components (collective)."""
         row, column, value = blocks_of_matrix(self.space, G)
-        asked, at = np.unique(column, return_inverse=True)
-        there = self.space.ask_owners(asked, free.astype(float))[at]
+        distinct, at = np.unique(column, return_inverse=True)
+        there = self.space.ask_owners(distinct, free.astype(float))[at]
         return Blocks(row, column, value * free[row - self.space.first][:, :, None] * there[:, None, :])
 
     def _find(self, entries: Entries, blocks: Blocks) -> tuple[Ints, Bools]:

@@ -314,7 +314,7 @@ class MeanMotion(given.Sealed):
 
     Raises:
         InputError, InputTypeError: for a vector or values of another form. When the problem is made also a TagError for an invalid part,
-            and a ConflictError if conditions hold all of its nodes.
+            and a ConflictError if conditions prescribe all of its nodes.
     """
 
     firm = True

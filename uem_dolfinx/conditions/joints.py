@@ -222,8 +222,8 @@ class Ball(Joint):
         point: reference position of the common point ``(gdim,)``; it need not be a node.
 
     Raises:
-        InputError, InputTypeError: for values of another form, for twice the same part, and for couplings with ``distribute=True``;
-            when the problem is made, for parts that are not in it, and for large and small rotations together.
+        InputError, InputTypeError: for values of another form, for twice the same part, and for couplings with ``distribute=True``.
+            When the problem is made: for parts that are not in it, and for large and small rotations together.
     """
 
     def __init__(self, a: RigidCoupling | None, b: RigidCoupling | None, point: npt.ArrayLike):
@@ -322,7 +322,7 @@ class Slider(Joint):
 
     @property
     def displacement(self) -> float:
-        """Displacement of b's point along the axis from its place in a (collective)."""
+        """Displacement of b's point along the axis from its reference position in a (collective)."""
         return self._now()
 
 

@@ -14,7 +14,7 @@ from uem_dolfinx.conditions.rigid_coupling import RigidCoupling
 from uem_dolfinx.conditions.rigid_set import Placement, RigidSets
 from uem_dolfinx.errors import ConflictError
 
-#: Newton's method closes joints in so many steps; where it does not, the united system goes on. [bound; steps; -]
+#: Newton's method closes joints in so many steps; where it does not, the united system continues. [bound; steps; -]
 MOST_CLOSINGS = 12
 
 

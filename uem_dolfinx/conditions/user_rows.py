@@ -186,7 +186,7 @@ class UserRows:
             equations = one.rewritten(equations)
         return equations
 
-    def beside(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
+    def with_rewritten(self, multipliers: Array, equations: UnitingEquations, lam: Array) -> Array:
         """Multipliers of couplings ``(k,)`` from those with rewritten equations, whose original ones have ``lam (m,)`` (collective)."""
         # original equations act on the eliminated components directly
         forces = forces_of(self._config, equations, np.where(equations.active, lam, 0.0))

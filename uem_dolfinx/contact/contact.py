@@ -93,7 +93,7 @@ class Contact(WatchedContact, given.Sealed):
         offset: additional thickness of both surfaces together, a length, or a function of position or a Function as for ``friction``:
             gaps are smaller by it. If surfaces coincide, a positive offset is an interference, a negative one a clearance. It may be
             changed between steps, or by a function of the load factor, ``load`` of the problem.
-        adjust: a length, or True for a side of a target's facet (on a rigid surface ``max_penetration``): contactors with an
+        adjust: a length, or True for a side of a target's facet (on a rigid surface ``max_penetration``). Contactors with an
             initial gap or penetration of at most this length are initially in contact, free of stress. No node is moved: the
             initial gap of each contactor becomes part of its offset; :attr:`adjusted` is the largest. Tied contactors keep their
             gap, and ``adjust`` is the reach of the tie, by default True.
@@ -103,9 +103,9 @@ class Contact(WatchedContact, given.Sealed):
             ``Adhesion`` attracts all facing surfaces.
         leak: a ``Leak`` lets a fluid enter between the surfaces from one side, which presses on both.
         corners: True makes nodes at pointed convex edges of a meshed target contactors of the contactor's facets, too, with
-            ``"node_to_surface"`` and hard contact without wear, ``adjust`` and heat. False: they may enter between contactors.
-        edges: True holds sharp convex edges of both bodies apart where they cross in 3D, by one equation at each crossing; with what
-            ``corners`` goes with, mortar too, and ``"finite"`` sliding.
+            ``"node_to_surface"`` and hard contact without wear, ``adjust`` and heat. False: they may penetrate between contactors.
+        edges: True includes contact of sharp convex edges of both bodies that cross in 3D, by one equation at each crossing. It has
+            the restrictions of ``corners``, but supports mortar, and needs ``"finite"`` sliding.
         chords: build P with the straight pieces between a curved target's nodes [UEM, 4.5]; gaps, normal return and forces keep
             the true facet, so that the answer is the same, after more iterations.
         name: for messages and files; None takes the names of the tags.

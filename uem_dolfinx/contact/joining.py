@@ -87,7 +87,7 @@ def _pairs_of(contacts: Sequence[Contact], made: Sequence[PartsOfPair], together
     """Interfaces of contacts; one with a ``Member`` for each of those that are alike, if these are treated ``together`` (collective).
 
     Alike are node-to-surface contacts of meshes, or with rigid surfaces, with finite sliding, at degree 1, with the same normals and
-    target thickness, without friction or with Coulomb's law, without further parts, ties, wear and heat.
+    target thickness. They have no friction or Coulomb's law, and no further parts, ties, wear or heat.
     """
     groups: dict[Hashable, list[int]] = {}
     for k, (contact, own) in enumerate(zip(contacts, made)):

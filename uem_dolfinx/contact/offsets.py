@@ -11,7 +11,7 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
-from uem_dolfinx.contact.laws.law import Field, asked_at
+from uem_dolfinx.contact.laws.law import Field, evaluated_at
 from uem_dolfinx.parallel import reduced
 
 if TYPE_CHECKING:
@@ -40,13 +40,15 @@ class Offsets:
     def set(self, offset: Field) -> None:
         """Set an offset, in addition to adjusted and worn lengths; contactors must be placed again (collective)."""
         config, nodes, words = self.pair.config, self.pair.nodes, f"contact '{self._name}': offset"
-        self.declared = asked_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
+        self.declared = (
+            evaluated_at(config, nodes, words, offset, given.FINITE) if callable(offset) else np.full(len(nodes), offset)
+        )
         self._hand_over()
 
     def read_again(self, offset: fem.Function) -> bool:
         """Whether its values have changed since they were set (collective)."""
         pair = self.pair
-        now = asked_at(pair.config, pair.nodes, f"contact '{self._name}': offset", offset, given.FINITE)
+        now = evaluated_at(pair.config, pair.nodes, f"contact '{self._name}': offset", offset, given.FINITE)
         return reduced(pair.config.comm, not np.array_equal(now, self.declared), op=MPI.LOR)
 
     def wear(self, worn: Array) -> None:

@@ -42,10 +42,11 @@ class Preload(Contact):
         force: force in the section, positive in tension, of the modelled part: half of it for half a bolt, the full circle for
             axisymmetry. A number acts in full from the first step on; a function is called with the load factor, in time steps with
             the time.
-        shortening: instead of a force, by how much the bolt is shortened, a length, as by turning its nut; a number or such a function.
+        shortening: instead of a force, the decrease of the bolt's length, as by turning its nut; a number or such a function.
         coupling: see ``Contact``.
         measure: see ``Contact``.
-        heat: see ``Contact``; ``uem.Conductance(np.inf, field=1)`` for a bolt in one piece that was cut, which conducts nothing without.
+        heat: see ``Contact``; ``uem.Conductance(np.inf, field=1)`` for a bolt in one piece whose mesh was cut; by default nothing is
+            conducted.
         name: see ``Contact``.
 
     Raises:

@@ -1,6 +1,6 @@
 """Mass and inertia that rigid couplings add at their points.
 
-They are represented by the point p and by unit axes d_i that rotate with the body: with the principal values I_i of the inertia about p,
+They are represented by the point p and by unit axes d_i that rotate with the body. With the principal values I_i of the inertia about p,
 and ``J_i = tr(I) / 2 - I_i``, the kinetic energy is, for every rotation,
 
     (m |p'|^2 + sum J_i |d_i'|^2) / 2

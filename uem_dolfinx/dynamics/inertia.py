@@ -41,14 +41,14 @@ class Dynamics(given.Sealed):
     Args:
         mass: of all bodies; bodies without mass are allowed if others or supports restrain them.
         scheme: ``newmark()`` or ``generalised_alpha(rho_inf)``, or explicit, ``CentralDifferences()``.
-        velocity: at the start: a Function of the displacement's space, the same for all ``(gdim,)``, or None for rest.
+        velocity: at the start: a Function of the displacement's space, a vector ``(gdim,)`` for all nodes, or None for rest.
         gravity: acceleration of free fall ``(gdim,)``; the weight of every node is its mass times gravity, so that free fall causes
             no strain.
         damping: function of the velocity, a UFL expression, that returns a form, linear in the test function, to add to the residual:
             ``lambda rate: eta * ufl.inner(ufl.sym(ufl.grad(rate)), ufl.sym(ufl.grad(v))) * ufl.dx``.
         contactors: ``"massless"`` moves the mass of the contactors to neighbouring nodes [UEM, 5], and also of the target nodes below
             them in bodies with fine meshes; impact itself then neither dissipates nor adds energy. ``"massy"`` does not move mass:
-            contact acts for whole steps, and a touch takes the energy of the masses that it stops.
+            contact acts for whole steps, and a first contact dissipates the energy of the masses that it stops.
         time: at the start.
 
     Attributes:

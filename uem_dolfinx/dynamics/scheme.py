@@ -119,7 +119,7 @@ class CentralDifferences:
     With lumped masses M of the nodes I, and S the nodes without mass, contactors and target surfaces among them,
 
         v(n+1/2) = v(n) + dt/2 a(n)            u_I(n+1) = u_I(n) + dt v(n+1/2)
-        F_S(u_I(n+1), u_S(n+1)) = contact forces, gaps closed and cones of friction met, as in statics
+        F_S(u_I(n+1), u_S(n+1)) = contact forces, closed gaps and friction within its cones, as in statics
         a(n+1) = -M^-1 F_I(u(n+1))             v(n+1) = v(n+1/2) + dt/2 a(n+1)
 
     A step of bodies with linear elasticity multiplies by K instead of assembling the residual, unless their loads change. Where contact

@@ -97,7 +97,7 @@ def connected(comm: MPI.Comm, n: int, links: Ints, shared: Callable[[Ints], Ints
         n: number of items of this rank.
         links: pairs of these ``(k, 2)``.
         shared: makes of the labels of this rank's items ``(n,)``, unlike those of other ranks, pairs of labels ``(l, 2)`` of items here
-            and there that are connected; asked for on several ranks alone (collective).
+            and there that are connected; called on several ranks only (collective).
     """
     count, piece = _components(n, links)
     if comm.size == 1:

@@ -28,14 +28,14 @@ ALL_PAIRS = 2**15
 
 @timed_as("search")
 def candidate_pairs(
-    shape: FacetShape, x: Array, points: Array, asked: Ints | None = None, surface: Ints | None = None
+    shape: FacetShape, x: Array, points: Array, surface_of_point: Ints | None = None, surface: Ints | None = None
 ) -> tuple[Ints, Ints]:
     """Indices ``(k,)`` of points and of facets that can be closest; with many facets by one tree of midpoints per size class.
 
-    A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives; sorting the facets
+    A facet of radius R is a candidate if its middle is within R of the bound that the nearest middle gives. Sorting the facets
     into classes of like radius keeps a graded mesh from paying for its largest facet everywhere. Every one of the
     ``points (n, gdim)`` occurs at least once if there are facets, whose nodes are at ``x (m, nn, gdim)``. With numbers of surfaces those of
-    each point's surface, ``asked (n,)``, are candidates alone, ``surface (m,)``; every point's has some.
+    each point's surface, ``surface_of_point (n,)``, are its only candidates; ``surface (m,)`` are those of the facets.
     """
     if len(points) == 0 or len(x) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -46,10 +46,10 @@ def candidate_pairs(
     normal = unit_normals(tab, x)
     bulge = shape.lebesgue * np.abs(np.einsum("mag,mg->ma", arm, normal)).max(axis=1)
     places, middles = points, middle
-    if asked is not None and surface is not None:
+    if surface_of_point is not None and surface is not None:
         # a further axis, along which different surfaces are too far from each other to be near
         far = 4.0 * float(np.ptp(np.concatenate([points, middle]), axis=0).sum() + radius.max())
-        places, middles = np.column_stack([points, far * asked]), np.column_stack([middle, far * surface])
+        places, middles = np.column_stack([points, far * surface_of_point]), np.column_stack([middle, far * surface])
     if len(places) * len(middles) <= ALL_PAIRS:
         distance = np.sqrt(sum([(places[:, None, k] - middles[:, k]) ** 2 for k in range(places.shape[1])]))
         bound = distance.min(axis=1) * (1 + EQUALLY_NEAR)
@@ -62,8 +62,8 @@ def candidate_pairs(
     # a facet lies in a flat disc about its midpoint; from a distance, fewer discs than balls are near
     away = points[i] - middle[f]
     height = np.abs(np.einsum("kg,kg->k", away, normal[f]))
-    beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
-    too_far = np.hypot(np.maximum(height - bulge[f], 0.0), np.maximum(beside - radius[f], 0.0)) > bound[i]
+    lateral = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
+    too_far = np.hypot(np.maximum(height - bulge[f], 0.0), np.maximum(lateral - radius[f], 0.0)) > bound[i]
     return i[~too_far], f[~too_far]
 
 

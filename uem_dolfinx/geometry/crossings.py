@@ -1,7 +1,7 @@
 """Crossings of straight paths of points with moving facets: exact times, and entry into or exit from the body.
 
 Facets are cut into simplices between neighbouring nodes. Points and nodes move on straight paths, so that the height of a point over the
-plane of a simplex is a cubic polynomial of time (in 2D quadratic); its roots are bracketed by its extremes. For a body that rotates and
+plane of a simplex is a cubic polynomial of time (in 2D quadratic). Its roots are bracketed by its extremes. For a body that rotates and
 deforms, paths are straight relative to the facets, which rotate with the body around them.
 
 Sharp convex edges of surfaces in 3D, and crossings of edges of two surfaces inside both bodies, between their nodes.

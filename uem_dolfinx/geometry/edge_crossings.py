@@ -104,11 +104,11 @@ class SharpLines:
         there, other, far, out = exchange.send(nodes.ravel(), nodes[:, ::-1].ravel(), length.ravel(), way)
         i, j = pairs_of_equals(there)
         i, j = (k[i != j] for k in (i, j))
-        goes_on = (np.bincount(i, minlength=len(there)) == 1)[i] & (-np.einsum("kg,kg->k", out[i], out[j]) > SHARP_EDGE)
-        beside, beyond = np.full(len(there), np.inf), np.full(len(there), -1)
-        beside[i[goes_on]], beyond[i[goes_on]] = far[j[goes_on]], other[j[goes_on]]
+        continues = (np.bincount(i, minlength=len(there)) == 1)[i] & (-np.einsum("kg,kg->k", out[i], out[j]) > SHARP_EDGE)
+        to_next, beyond = np.full(len(there), np.inf), np.full(len(there), -1)
+        to_next[i[continues]], beyond[i[continues]] = far[j[continues]], other[j[continues]]
         lengths, others = np.empty(nodes.size), np.empty(nodes.size, np.int64)
-        lengths[exchange.rows], others[exchange.rows] = exchange.back(beside, beyond)
+        lengths[exchange.rows], others[exchange.rows] = exchange.back(to_next, beyond)
         before, after = lengths.reshape(-1, 2).T
         first, last = others.reshape(-1, 2).T
         self.ends: Bools = np.column_stack([first < 0, last < 0])

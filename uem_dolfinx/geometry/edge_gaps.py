@@ -31,10 +31,10 @@ def cubics(before: Array, length: Array, after: Array) -> Array:
     k = len(length)
     # slopes over the length of the piece at its ends
     slopes = np.zeros((k, 2, 4))
-    for end, (beside, sign) in enumerate(((before, 1.0), (after, -1.0))):
+    for end, (spacing, sign) in enumerate(((before, 1.0), (after, -1.0))):
         here, there, out = (1, 2, 0) if end == 0 else (2, 1, 3)
-        last = ~np.isfinite(beside)
-        h = np.where(last, 1.0, beside)
+        last = ~np.isfinite(spacing)
+        h = np.where(last, 1.0, spacing)
         own = np.where(last, 1.0, h / (h + length))
         other = np.where(last, 0.0, length**2 / (h * (h + length)))
         slopes[:, end, there] = sign * own

@@ -79,9 +79,9 @@ class TargetFacets:
     def values_at(self, facet: Ints, values: AnyArray) -> Any:
         """Values ``(m, ...)`` of ranks' own facets at the facets numbered ``facet (n,)``: ``(n, ...)``, -1 for -1 (collective)."""
         exchange = self.owners(facet)
-        (asked,) = exchange.send(facet)
+        (received,) = exchange.send(facet)
         found = np.full((len(facet), *values.shape[1:]), -1, dtype=values.dtype)
-        (found[exchange.rows],) = exchange.back(values[asked - self.first[self.config.comm.rank]])
+        (found[exchange.rows],) = exchange.back(values[received - self.first[self.config.comm.rank]])
         return found
 
     def _orient(self, cell_dofs: Indices) -> None:

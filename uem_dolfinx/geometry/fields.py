@@ -248,8 +248,8 @@ class Unknowns(Nodes):
         forms.assemble_matrix(there, a)
         indptr, columns, _ = there.getValuesCSR()
         there.destroy()
-        g, (asked, at) = self.block, np.unique(columns, return_inverse=True)
-        column = self._numbers_of(asked)[at] // g
+        g, (distinct, at) = self.block, np.unique(columns, return_inverse=True)
+        column = self._numbers_of(distinct)[at] // g
         row = np.repeat(self.place // g, np.diff(indptr))
         every = np.arange(self.n_owned)
         keys = np.unique(np.append(row * self.n_global + column, every * self.n_global + every + self.first))
@@ -270,9 +270,9 @@ class Unknowns(Nodes):
         """Vector components, over all ranks, of DOLFINx's global ``unknowns (k,)`` of any rank (collective)."""
         first = gathered(self.comm, int(self._map.local_range[0]))
         asking = Exchange.to(self.comm, np.searchsorted(first, unknowns, side="right") - 1)
-        (asked,) = asking.send(unknowns)
+        (received,) = asking.send(unknowns)
         found = np.empty(len(unknowns), dtype=np.int64)
-        (found[asking.rows],) = asking.back(self.numbers[asked - first[self.comm.rank]])
+        (found[asking.rows],) = asking.back(self.numbers[received - first[self.comm.rank]])
         return found
 
     def multipliers(self, A: PETSc.Mat) -> int:

@@ -54,7 +54,7 @@ def example_mesh(name: str) -> Path:
         name: without ending, as ``"hertz_cylinder"``.
 
     Raises:
-        InputError, InputTypeError: with the names that there are.
+        InputError, InputTypeError: for another name, with all valid names.
     """
     return EXAMPLES / f"{given.word('name', name, sorted(path.stem for path in EXAMPLES.glob('*.geo')))}.geo"
 
@@ -80,7 +80,7 @@ def read_gmsh(
         gdim: geometric dimension, 2 or 3; by default that of the model. The coordinate ``z`` is dropped in 2D.
         parameters: numbers for the ``.geo`` file's ``DefineConstant``.
         size: sizes of cells instead of those of the ``.geo`` file, as ``adapt`` passes them to its ``make``; None keeps the file's.
-        cut: name of a plane group of facets that divides a body, or several: nodes are doubled there, the group is one face, and
+        cut: name of a plane group of facets that divides a body, or several. Nodes are doubled there, the group is one face, and
             ``"name back"`` is the other one, as a section of a bolt needs.
 
     Returns:

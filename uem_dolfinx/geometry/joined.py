@@ -108,23 +108,23 @@ class JoinedTarget(MeshTarget):
         surface: number of the surface that each contactor may touch ``(n,)``.
 
     Attributes:
-        asked: contactors that are projected ``(n,)``; others get the projection ``nowhere``.
+        projected: contactors that are projected ``(n,)``; others get the projection ``nowhere``.
     """
 
     facets: JoinedFacets
 
     def __init__(self, facets: JoinedFacets, averaged: bool, surface: Ints):
         super().__init__(facets, averaged)
-        self._surface, self.asked = surface, np.ones(len(surface), dtype=bool)
+        self._surface, self.projected = surface, np.ones(len(surface), dtype=bool)
 
     def project(self, points: Array, which: Ints | None = None) -> FacetProjection:
         """Closest points of contactors on their own targets; ``nowhere`` for contactors that are skipped (collective)."""
-        asked = self.asked if which is None else self.asked[which]
-        surface = (self._surface if which is None else self._surface[which])[asked]
-        nearest = self.project_onto(points[asked], surface)
-        if asked.all():
+        chosen = self.projected if which is None else self.projected[which]
+        surface = (self._surface if which is None else self._surface[which])[chosen]
+        nearest = self.project_onto(points[chosen], surface)
+        if chosen.all():
             return nearest
-        return self.nowhere(points).with_those(np.flatnonzero(asked), nearest)
+        return self.nowhere(points).with_those(np.flatnonzero(chosen), nearest)
 
     def project_onto(self, points: Array, surface: Ints) -> FacetProjection:
         """Closest points of ``points (k, gdim)`` on the surfaces numbered ``surface (k,)`` (collective)."""
@@ -144,8 +144,8 @@ class JoinedTarget(MeshTarget):
 
     def _answers(self, exchange: Exchange, points: Array, surface: Ints, data: FacetData) -> Feet:
         """Closest points on the facets of the ranks of an exchange, in the order of its rows (collective)."""
-        p, asked = exchange.send(points, surface)
-        return Feet._make(exchange.back(*self._nearest_here(p, asked, data)))
+        p, wanted = exchange.send(points, surface)
+        return Feet._make(exchange.back(*self._nearest_here(p, wanted, data)))
 
     def _nearest_here(self, points: Array, surface: Ints, data: FacetData) -> Feet:
         """Closest points on this rank's facets of each point's surface."""

@@ -1,6 +1,6 @@
 """Lists of the facets that each surface node may touch, rebuilt only after a body has moved far enough.
 
-A facet may hold a node if three conditions are met: its body comes after the node's own in the order, it faces the node, and the
+A facet may constrain a node under three conditions: its body comes after the node's own in the order, it faces the node, and the
 node was in front of it in the last accepted state. Nodes at sharp edges follow in both directions, since they could otherwise
 penetrate between the nodes of the other surface. Facets that are not listed cost nothing.
 """
@@ -34,7 +34,7 @@ AHEAD_AT_REST = 0.5
 #: [convention; motion in a step; test_neighbours.py::test_lists_last]
 STEPS_AHEAD = 4.0
 #: A facet faces a node if the cosine of the angle between its normal and one around the node, see ``Skin.cones``, is below minus this.
-#: [convention; cosine; test_neighbours.py::test_who_faces_whom]
+#: [convention; cosine; test_neighbours.py::test_facing_pairs]
 FACED = 0.5
 #: Of two places of one body that meet, the nodes of that one follow whose normal in the reference configuration points more in this
 #: direction, or that lies farther in it: its slopes are irrational, so that no side of a body is likely to lie along it.
@@ -221,16 +221,16 @@ class Neighbours:
         inside &= self._overlap > 0.0
         order = np.lexsort((key, distance, ~((front & faces) | inside[pair]), pair))
         nearest = order[np.searchsorted(pair[order], np.arange(len(known)))][pair]
-        beside = np.einsum("kg,kg->k", normal, normal[nearest]) > -FACED
-        return np.asarray(faces & np.where(inside[pair], beside, front | (beside & (front & faces)[nearest])))
+        same_side = np.einsum("kg,kg->k", normal, normal[nearest]) > -FACED
+        return np.asarray(faces & np.where(inside[pair], same_side, front | (same_side & (front & faces)[nearest])))
 
     def _open_sides(self, row: Ints, facet: Ints, across: Ints) -> Bools:
         """Sides of facets beyond which no facet is listed for the same node: closest points there are past an end ``(k, n_sides)``."""
         most = self.skin.first[-1]
         listed = np.sort(row * most + facet)
-        asked = np.where(across >= 0, row[:, None] * most + across, -1)
-        at = np.minimum(np.searchsorted(listed, asked), max(len(listed) - 1, 0))
-        return np.asarray(listed[at] != asked if len(listed) else np.ones(asked.shape, bool))
+        queried = np.where(across >= 0, row[:, None] * most + across, -1)
+        at = np.minimum(np.searchsorted(listed, queried), max(len(listed) - 1, 0))
+        return np.asarray(listed[at] != queried if len(listed) else np.ones(queried.shape, bool))
 
     def _pairs(self, of: Asking) -> tuple[Ints, Ints, Array, Array, Bools, Bools, Array]:
         """Nodes and this rank's facets that may touch.
@@ -319,10 +319,10 @@ class Neighbours:
         """A list of pairs of nodes, ``row (k,)`` on the ranks ``home (k,)``, and facets (collective)."""
         comm = self._config.comm
         n = len(self.nodes) if comm.size == 1 else int(reduced(comm, len(self.nodes), op=MPI.MAX))
-        asked, node = np.unique(home * n + row, return_inverse=True)
+        queried, node = np.unique(home * n + row, return_inverse=True)
         # ranks with facets request their nodes, which then arrive in the requested order
-        back = Exchange.to(comm, asked // max(n, 1))
-        (rows,) = back.send(asked % max(n, 1))
+        back = Exchange.to(comm, queried // max(n, 1))
+        (rows,) = back.send(queried % max(n, 1))
         ends = np.searchsorted(back.origins, np.arange(comm.size + 1))
         return Listing(Exchange(comm, [rows[a:b] for a, b in pairwise(ends)]), node.ravel(), facet, *more, empty)
 

@@ -20,8 +20,8 @@ from uem_dolfinx.parallel import Exchange
 #: Facets face each other if the cosine of the angle between one's normal and the other's reversed is larger.
 #: [convention; cosine; test_opposite.py::test_facets_that_face_each_other]
 FACING = 0.6
-#: Those that have faced each other in a step do so until its end unless the cosine is smaller than this: sides of a corner that turn with
-#: the forces would else be opposite to each other and not by turns.
+#: Facets that have been opposite to each other in a step remain so until its end unless the cosine is smaller than this. Sides of a
+#: corner that rotate with the forces would otherwise alternate between opposite and not.
 #: [convention; cosine; test_opposite.py::test_facets_that_have_faced_each_other]
 STILL_FACING = 0.2
 
@@ -60,14 +60,14 @@ def find_opposite(
     middle = x.mean(axis=1)
     radius = np.linalg.norm(x - middle[:, None], axis=2).max(axis=1, initial=0.0)
     here = target.facets.x
-    asked = [middle, radius, reach, planes.normal]
+    queried = [middle, radius, reach, planes.normal]
     visibility = np.zeros((len(x), 0)) if visibility is None else visibility
     if comm.size == 1:
-        i, f = _allowed(target, visibility, *_candidates(target, here, *asked))
+        i, f = _allowed(target, visibility, *_candidates(target, here, *queried))
         return _facing(target.shape, planes, faced, i, here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     exchange = Exchange(comm, target.boxes(here).near(middle, radius + reach))
     mine = np.arange(len(x))
-    *arrived, visibility, row, rank = exchange.send(*asked, visibility, mine, np.full(len(x), comm.rank))
+    *arrived, visibility, row, rank = exchange.send(*queried, visibility, mine, np.full(len(x), comm.rank))
     i, f = _allowed(target, visibility, *_candidates(target, here, *arrived))
     found = Exchange.to(comm, rank[i]).send(row[i], here[f], target.facets.nodes[f], target.keys[f], target.facets.sign[f])
     return _facing(target.shape, planes, faced, *found)
@@ -103,9 +103,9 @@ def _facing(
     if faced is not None and len(faced[1]):
         keys, before = faced
         unsure = np.flatnonzero(~kept)
-        asked = np.column_stack([keys[facet[unsure]], key[unsure]])
-        before = before[np.isin(before[:, 0], asked[:, 0])]
-        _, number = np.unique(np.concatenate([before, asked]), axis=0, return_inverse=True)
+        queried = np.column_stack([keys[facet[unsure]], key[unsure]])
+        before = before[np.isin(before[:, 0], queried[:, 0])]
+        _, number = np.unique(np.concatenate([before, queried]), axis=0, return_inverse=True)
         number = number.ravel()
         kept[unsure] = np.isin(number[len(before) :], number[: len(before)])
     i = np.flatnonzero(kept)
@@ -128,9 +128,9 @@ def _candidates(target: MeshTarget, y: Array, middle: Array, radius: Array, reac
     i, f = np.divmod(np.unique(row[b] * len(y) + f), len(y))
     away = centre[f] - middle[i]
     height = np.einsum("kg,kg->k", away, normal[i])
-    beside = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
+    lateral = np.sqrt(np.maximum(np.einsum("kg,kg->k", away, away) - height**2, 0.0))
     both = radius[i] + size[f]
-    kept = (np.einsum("kg,kg->k", normal[i], outward[f]) < -STILL_FACING) & (beside < both) & (np.abs(height) < reach[i] + both)
+    kept = (np.einsum("kg,kg->k", normal[i], outward[f]) < -STILL_FACING) & (lateral < both) & (np.abs(height) < reach[i] + both)
     return i[kept], f[kept]
 
 

@@ -20,7 +20,7 @@ from uem_dolfinx.parallel import reduced
 #: [convention; cosine; test_corner_contact.py::test_which_edges_are_pointed]
 POINTED = 0.86
 #: A contactor so near to a pointed edge of its target, and to the facet, is left to the equations of the edge's nodes.
-#: [convention; size of the contactor's own facets; test_corner_contact.py::test_who_is_left_out]
+#: [convention; size of the contactor's own facets; test_corner_contact.py::test_edges_without_corner_contact]
 AT_CORNER = 0.05
 
 
@@ -56,8 +56,8 @@ def with_outside(facets: TargetFacets) -> tuple[TargetFacets, Bools]:
         return facets, np.ones(len(facets.dofs), bool)
     outside = exterior_facets(config)
     of = nodes_of_facets(config, outside)
-    beside = facets.on_sides(facets.open_sides)[of.dofs].any(axis=1)
-    entities = np.union1d(facets.entities, outside.entities[of.own][beside]).astype(np.int32)
+    at_open_sides = facets.on_sides(facets.open_sides)[of.dofs].any(axis=1)
+    entities = np.union1d(facets.entities, outside.entities[of.own][at_open_sides]).astype(np.int32)
     whole = TargetFacets(config, Tag(facets.tag.name, 0, config.tdim - 1, config.mesh, entities))
     return whole, np.isin(whole.entities, facets.entities)
 

@@ -190,18 +190,18 @@ class FacetProjection:
         away = points - self.foot
         length, lean = np.linalg.norm(away, axis=1), np.einsum("ng,ng->n", away, self.normal)
         # the direction from the closest point is rounding if the distance vanishes
-        beside = (length > ALONG_NORMAL * self.facet_size) & (np.abs(lean) < (1.0 - ALONG_NORMAL) * length)
-        beside &= ~self.beyond.any(axis=1)
+        rounded = (length > ALONG_NORMAL * self.facet_size) & (np.abs(lean) < (1.0 - ALONG_NORMAL) * length)
+        rounded &= ~self.beyond.any(axis=1)
         side = np.where(lean < 0.0, -1.0, 1.0)
         # an arc about the edge with the offset as radius, extended to twice the radius
-        beside &= (np.abs(offset) > ROUNDS_AN_EDGE * self.facet_size) & (side * offset > 0.0) & (length < 2.0 * np.abs(offset))
+        rounded &= (np.abs(offset) > ROUNDS_AN_EDGE * self.facet_size) & (side * offset > 0.0) & (length < 2.0 * np.abs(offset))
         n = side[:, None] * away / np.where(length > 0.0, length, 1.0)[:, None]
-        return replace(self, gap=np.where(beside, side * length, self.gap), normal=np.where(beside[:, None], n, self.normal))
+        return replace(self, gap=np.where(rounded, side * length, self.gap), normal=np.where(rounded[:, None], n, self.normal))
 
     def behind_edges(self, points: Array) -> Ints:
         """Which ``points (n, gdim)`` are inside the target, and below no point of their facet, but behind a shallow concave edge of it."""
-        beside = np.linalg.norm(points - self.foot - self.height[:, None] * self.normal, axis=1)
-        behind = (beside > ALONG_NORMAL * self.facet_size) & (beside < SHALLOW * -self.height)
+        lateral = np.linalg.norm(points - self.foot - self.height[:, None] * self.normal, axis=1)
+        behind = (lateral > ALONG_NORMAL * self.facet_size) & (lateral < SHALLOW * -self.height)
         return (behind & ~self.beyond.any(axis=1)).nonzero()[0]
 
     @cached_property
@@ -217,8 +217,8 @@ class FacetProjection:
         """Second derivative of the gap, for the consistent tangent (the term that [UEM, 5.7] drops).
 
         With the moving tangents ``t_a``, ``D_a`` the derivative of the closest point's coordinate and ``N_a`` that of the facet's
-        slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b;
-        on a straight 2D facet this is the formula of the method's description.
+        slope, it reads ``- (D_a N_a' + N_a D_a') - b_ab D_a D_b' + g m^ab (N_a + b D)(N_b + b D)'`` summed over a, b.
+        On a straight 2D facet this is the formula of the method's description.
         """
         H = gap_hessians(*self._at(which))
         if len(i := self._from_edge[which].nonzero()[0]):

@@ -133,7 +133,7 @@ class RigidSurface(given.Sealed):
     n_nodes = 0
     averaged = faceted = False
     measures = False  #: Whether gaps are distances everywhere, not only on the surface.
-    of_user = True  #: Whether functions are the user's, which may raise or return other shapes than asked for.
+    of_user = True  #: Whether functions are the user's, which may raise or return other shapes than required.
     dofs: Indices = np.zeros((0, 0), np.int32)
     keys: Ints = np.zeros(0, np.int64)
 
@@ -224,11 +224,11 @@ class RigidSurface(given.Sealed):
         if motion is not None and len(motion.translation) != g:
             raise InputError(f"{self.name} was moved in {len(motion.translation)}D but is met by points in {g}D: move it in {g}D")
         X = points if motion is None else motion.back(points)
-        slope = self._asked("gradient", self.gradient, X, (n, g))
+        slope = self._evaluated("gradient", self.gradient, X, (n, g))
         length = np.linalg.norm(slope, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             normal = slope / length[:, None]
-            gap = self._asked("distance", self.distance, X, (n,)) / length
+            gap = self._evaluated("distance", self.distance, X, (n,)) / length
         shape_operator = self._shape_operator(X, normal, length)
         if motion is not None:
             normal, shape_operator = normal @ motion.Q.T, motion.Q @ shape_operator @ motion.Q.T
@@ -271,19 +271,19 @@ class RigidSurface(given.Sealed):
         """``t . grad^2 phi . t / |grad phi|`` in the tangent plane."""
         n, g = points.shape
         if self.hessian is not None:
-            H = self._asked("hessian", self.hessian, points, (n, g, g))
+            H = self._evaluated("hessian", self.hessian, points, (n, g, g))
         else:
             extent = np.abs(points).max(initial=0.0)
             h = np.cbrt(np.finfo(float).eps) * (extent if extent > 0 else 1.0)
             ahead, behind = (
-                [self._asked("gradient", self.gradient, points + side * h * e, (n, g)) for e in np.eye(g)] for side in (1, -1)
+                [self._evaluated("gradient", self.gradient, points + side * h * e, (n, g)) for e in np.eye(g)] for side in (1, -1)
             )
             H = (np.stack(ahead, axis=2) - np.stack(behind, axis=2)) / (2 * h)
             H = 0.5 * (H + H.transpose(0, 2, 1))
         T = np.eye(g) - normal[:, :, None] * normal[:, None, :]
         return T @ H @ T / length[:, None, None]
 
-    def _asked(self, what: str, f: Callable[[Array], Array], points: Array, shape: tuple[int, ...]) -> Array:
+    def _evaluated(self, what: str, f: Callable[[Array], Array], points: Array, shape: tuple[int, ...]) -> Array:
         """Values of a function at ``points (n, gdim)``, which must have this shape; it is not called without points."""
         if not len(points):
             return np.zeros(shape)

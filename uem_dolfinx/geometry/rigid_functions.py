@@ -12,7 +12,7 @@ import numpy as np
 
 from uem_dolfinx.arrays import Array, numbers_only
 
-#: Functions are asked about so many points at least: more than there are coordinates, so that shapes tell which axis is that of points.
+#: Functions are called with at least so many points: more than there are coordinates, so that shapes identify the axis of points.
 #: [format; points; test_rigid.py::test_functions_of_places]
 LEAST_POINTS = 5
 
@@ -28,7 +28,7 @@ class OfPoints:
     def of(self, f: Callable[[Array], Any]) -> Callable[[Array], Any]:
         """The same function for points ``(n, gdim)``, with one row per point in the result."""
 
-        def asked(points: Array) -> Any:
+        def evaluated(points: Array) -> Any:
             n, g = points.shape
             if n and self._takes_places(points):
                 x = _places(points)
@@ -38,7 +38,7 @@ class OfPoints:
                 self._of_places = False
             return values
 
-        return asked
+        return evaluated
 
     def _takes_places(self, points: Array) -> bool:
         if self._of_places is None:

@@ -19,7 +19,7 @@ from uem_dolfinx.geometry.projection import FacetProjection
 from uem_dolfinx.geometry.shapes import FacetShape, Tabulated, beneath, closest_point, unit_normals
 from uem_dolfinx.parallel import Exchange, reduced
 
-#: An averaged normal that leans further from the facet's no longer tells where the facet is.
+#: An averaged normal that leans further from the facet's no longer determines the position of the facet.
 #: [convention; cosine of their angle; test_thresholds_geometry.py::test_gap_along_a_leaning_normal]
 LEAST_LEAN = 0.1
 #: A foot that is nearer to a side of its facet lies on it, and a point that is nearer to the foot on the facet.

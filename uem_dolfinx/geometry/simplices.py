@@ -171,11 +171,11 @@ def completed(found: Found) -> tuple[Found, int]:
     Cells that share a quadrilateral share its new node. Sets with all nodes of a quadrilateral or hexahedron get its new node, but for
     sets of single points.
     """
-    asked = [block for block in found.cells if block.type in SERENDIPITY]
-    if not asked:
+    incomplete = [block for block in found.cells if block.type in SERENDIPITY]
+    if not incomplete:
         return found, 0
     # nodes of all distinct quadrilaterals, by their vertices
-    parts = [_quads(block) for block in asked]
+    parts = [_quads(block) for block in incomplete]
     corners, edges = (np.concatenate([part[i].reshape(-1, 4) for part in parts]) for i in (0, 1))
     _, first, number = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_inverse=True)
     x = found.points

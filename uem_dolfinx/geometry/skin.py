@@ -232,12 +232,12 @@ def classes_of_facets(skin: Skin) -> tuple[Ints, int]:
     facet, side = np.nonzero(skin.edges.sharp & (skin.edges.across >= 0))
     meeting = np.unique(np.column_stack([face[facet], skin.values_at(skin.edges.across[facet, side], face)]), axis=0)
     meeting = np.concatenate(skin.config.comm.allgather(meeting))
-    beside: list[set[int]] = [set() for _ in range(count)]
+    adjacent: list[set[int]] = [set() for _ in range(count)]
     for a, b in meeting[meeting[:, 0] != meeting[:, 1]].tolist():
-        beside[a].add(b)
+        adjacent[a].add(b)
     given = np.full(count, -1)
     for one in np.argsort(first).tolist():
-        taken = {int(given[other]) for other in beside[one]}
+        taken = {int(given[other]) for other in adjacent[one]}
         given[one] = next(k for k in range(count) if k not in taken)
     return given[face], int(given.max(initial=0)) + 1
 

@@ -22,7 +22,7 @@ Key: TypeAlias = "str | int | tuple[int, str | int]"
 
 Part: TypeAlias = Any
 """A ``Tag``; ``(meshtags, value)`` or ``(meshtags, values)`` with DOLFINx MeshTags; local indices of facets (of cells where cells
-are asked for), which each rank may give for what it owns, or also for ghosts; or a list of any of these, their union."""
+are required), which each rank may give for entities that it owns, or also for ghosts; or a list of any of these, their union."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Tag(given.Copied):
         dim: dimension of the entities.
         mesh: the mesh they belong to.
         entities: local indices of the entities on this rank, ghosts included, ascending, shape ``(n,)``.
-        insides: of a set of nodes, whose entities are vertices, also the edges, faces and cells in whose middle it has a node: likewise of
-            the dimensions 1, 2 ... each; empty for all other groups.
+        insides: of a set of nodes, whose entities are vertices, the edges, faces and cells in whose middle it has a node, one array for
+            each dimension 1, 2 ...; empty for all other groups.
     """
 
     name: str | None

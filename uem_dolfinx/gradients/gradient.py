@@ -69,13 +69,13 @@ def gradient(problem: UnitedProblem, J: ufl.Form, controls: Sequence[AnyControl]
 
     Returns:
         For every control, in the same order, the derivatives by its entries: an array of the shape of a Constant's value or a parameter,
-        a Function of the control's space, or for the shape a Function of vectors at the mesh's nodes: of the displacement's space, or for
-        straight cells with a displacement of degree 2 of a vector space of degree 1.
+        or a Function of the control's space. For the shape, a Function of vectors at the mesh's nodes, of the displacement's space. For
+        straight cells with a displacement of degree 2 it is of a vector space of degree 1.
 
     Raises:
         InputError, InputTypeError: if the gradient depends on the history of all steps, if the problem has no step or no consistent
-            tangent, or if its parameters have changed since the last step; for an object that is no functional or no control of this
-            problem; for a J with pressures of contactors in concave corners of the target, or of contactors with conflicting equations.
+            tangent, or if its parameters have changed since the last step. For an object that is no functional or no control of this
+            problem. For a J with pressures of contactors in concave corners of the target, or of contactors with conflicting equations.
         LinearSolveError: if the constrained matrix is singular.
     """
     check_problem(problem, recorded=False)
@@ -105,8 +105,8 @@ def tangent(problem: UnitedProblem, direction: Sequence[tuple[AnyControl, Any]],
 
     Args:
         problem: as in :func:`gradient`.
-        direction: pairs of a control, as in :func:`gradient`, and its change: for a Constant or a parameter of a contact an array of its
-            shape, for a Function a Function of its space, for the shape a Function as :func:`gradient` returns it.
+        direction: pairs of a control, as in :func:`gradient`, and its change. For a Constant or a parameter of a contact this is an
+            array of its shape, for a Function a Function of its space, and for the shape a Function as :func:`gradient` returns it.
         of: the ``pressure`` of a contact of the problem; None for the displacement.
 
     Returns:
@@ -318,13 +318,13 @@ def refuse_idle_controls(
 ) -> None:
     """Refuse Constants and Functions that occur neither in the problem nor in a functional (collective)."""
     forms = [problem.bodies.F, *functionals]
-    beside = [problem.dynamics, problem.materials, constants_of(problem), fields_of(problem)]
+    further = [problem.dynamics, problem.materials, constants_of(problem), fields_of(problem)]
     n, bcs = len(problem.u.x.array), problem.bodies.bcs
     for i, m in enumerate(controls):
         if not isinstance(m, (fem.Constant, fem.Function)):
             continue
         held = any(m is one for form in forms for one in (*form.constants(), *form.coefficients()))
-        held = held or holds(beside, m) or bool(set_by([m], bcs, n).any())
+        held = held or holds(further, m) or bool(set_by([m], bcs, n).any())
         with agreed(problem.comm):
             moved = [value for value in motions_of(problem) if value is not m]
             if holds([*(rule.value for rule in rules_of(bcs)), *moved], m):

@@ -91,7 +91,7 @@ class History(given.Sealed):
         self._records.add(self._record(before, taken.by_id(), taken.held if held is None else held))
 
     def check_steps(self, steps: Sequence[Step]) -> None:
-        """Refuse Steps that change what the problem is, or that begin from forces that depend on its state (to be agreed on).
+        """Refuse Steps that change the problem itself, or that begin from forces that depend on its state (to be agreed on).
 
         Raises:
             InputError: names what is not recorded.
@@ -153,7 +153,7 @@ class History(given.Sealed):
 
         Args:
             J: functional of ``problem.u`` in the last step and of the controls, as in :func:`uem_dolfinx.gradient`; in time also of
-                ``velocity`` and ``acceleration`` of the dynamics; or a list of functionals, one for each step or None, whose sum is
+                ``velocity`` and ``acceleration`` of the dynamics. Or a list of functionals, one for each step or None, whose sum is
                 differentiated.
             controls: as in :func:`uem_dolfinx.gradient`, and coefficients of friction; in time also the Constant that is the density of
                 the mass, and the Function with the initial velocity; for ``VonMises`` the objects passed as its parameters.

@@ -42,8 +42,8 @@ class ContactParameter:
 
     Args:
         contact: of the problem.
-        parameter: ``"offset"``, a uniform increment of the contact's ``offset``, a length; ``"place"``, by which a rigid target
-            moves in all directions ``(gdim,)``, a length; ``"turn"``, by which it turns about its present reference point, an angle
+        parameter: ``"offset"``, a uniform increment of the contact's ``offset``, a length; ``"place"``, the translation of a
+            rigid target ``(gdim,)``, a length; ``"turn"``, its rotation about its present reference point, an angle
             in 2D, a rotation vector ``(3,)`` in 3D; ``"friction"``, a uniform increment of the coefficient of Coulomb's law, for
             histories; of a ``Preload`` its ``"force"`` or ``"shortening"``, the same increment in all steps that prescribe it.
 

@@ -41,7 +41,7 @@ def recording(
         problem: in statics or in time; supported are Coulomb friction with sliding='finite', at degree 2 in 2D and with mortar only, and
             ``VonMises`` or ``FinitePlasticity`` as law with history.
         scratch: folder for a file of each rank with the steps, which is deleted with the history; None keeps them in memory.
-        controls: of the derivatives that are wanted later, if known: those without derivatives are refused before the first step.
+        controls: of later derivatives, if known: controls without derivatives are refused before the first step.
 
     Yields: The history, which may be used in the block and after it.
 

@@ -100,7 +100,7 @@ class Elastic(given.Copied, ABC):
         return ufl.inner(self.first_piola(u), displacement_gradient(v))
 
     def thermal_residual(self, u: Any, v: Any, strain: Any) -> Expr:
-        """Virtual work per reference volume of the stress that a free strain, alpha times the heating, takes away: subtract it.
+        """Virtual work per reference volume of the stress that a free strain, alpha times the heating, relieves: subtract it.
 
         ``law.residual(u, v) - law.thermal_residual(u, v, alpha * (T - T0))``: for small strains of heating, also with large rotations.
         """
@@ -112,8 +112,8 @@ class Elastic(given.Copied, ABC):
         """Internal virtual work of nearly incompressible bodies, without locking as nu approaches 1/2.
 
         The volumetric part is integrated with fewer points: one in quadrilaterals and hexahedra of degree 1 and simplices of degree 2,
-        two in each direction in quadrilaterals and hexahedra of degree 2 (selective reduced integration; for quadrilaterals and small
-        strains equal to the mean dilatation method) [Malkus and Hughes, Computer Methods in Applied Mechanics and Engineering 15 (1978)
+        two in each direction in quadrilaterals and hexahedra of degree 2. This selective reduced integration is the mean dilatation
+        method for quadrilaterals and small strains [Malkus and Hughes, Computer Methods in Applied Mechanics and Engineering 15 (1978)
         63-81].
 
         Args:

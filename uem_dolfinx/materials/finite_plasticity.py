@@ -50,7 +50,7 @@ class FinitePlasticity(VonMises):
     follow Masing's rule.
 
     As in ``VonMises``, the volumetric part is integrated by a separate rule, so that the same cells do not lock, with one point in
-    quadrilaterals and hexahedra of degree 1; in axisymmetry ``J`` is then the volume ratio of the ring of the cell. This part is an
+    quadrilaterals and hexahedra of degree 1. In axisymmetry ``J`` is then the volume ratio of the ring of the cell. This part is an
     energy in ``J``, and the tangent is symmetric.
 
     Args:
@@ -143,7 +143,7 @@ class FinitePlasticity(VonMises):
         """J; for rings the present volume over the reference volume, exact if the cell is a parallelogram.
 
         A ring's volume is the integral of ``2 pi r`` over the cell's area. In a parallelogram ``r`` and the ratio of areas are linear in
-        each coordinate; the mean of their product is its value at the centre plus the product of their slopes along the sides over 12.
+        each coordinate. The mean of their product is its value at the centre plus the product of their slopes along the sides over 12.
         """
         F = ufl.Identity(3) + self._gradient(self._moved)
         if not self._of_rings:

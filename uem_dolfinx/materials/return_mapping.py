@@ -24,7 +24,7 @@ class Returned:
     """Stress, history and tangent after a return, at n points.
 
     Vectors hold the k components (11, 22, sqrt(2) 12) in plane stress, (11, 22, 33, sqrt(2) 12) in plane strain and axisymmetry, and
-    (11, 22, 33, sqrt(2) 23, sqrt(2) 13, sqrt(2) 12) in 3D, so that their dot product equals the tensors' inner product.
+    (11, 22, 33, sqrt(2) 23, sqrt(2) 13, sqrt(2) 12) in 3D. Their dot product then equals the tensors' inner product.
 
     Attributes:
         a, c, m: the tangent ``a I + c 1 x 1 - sum of m x m``, with the unit tensor 1 of the normal components and vectors m side by

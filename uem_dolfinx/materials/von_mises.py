@@ -58,14 +58,14 @@ class VonMises(given.Sealed):
     layer with its own history.
 
     Plastic flow is isochoric, so that some cells lock. Except in plane stress, the pressure, which is elastic in this law, is therefore
-    integrated by a separate rule. Errors of the limit load of Prandtl's punch in plane strain, perfectly plastic with a yield
-    strain of 0.001. The indentation is 0.03 of the width, with 8 linear or 4 quadratic cells beneath half of it:
+    integrated by a separate rule. These are errors of the limit load of Prandtl's punch in plane strain, perfectly plastic
+    with a yield strain of 0.001. The indentation is 0.03 of the width, with 8 linear or 4 quadratic cells beneath half of it:
 
     - degree 1 on quadrilaterals and hexahedra, 5.6 %: stress at 2 points per direction, pressure at the cell's centre, which is the
       B-bar method (Hughes, Int. J. Numer. Meth. Engng 15 (1980) 1413-1418); with the pressure at the stress's points it would be
-      35 % and increase with the load. Hexahedra that are no parallelepipeds then pass the patch test approximately: with nodes
-      moved by 10 % of a cell's size the error of stresses is 0.08 %, by 25 % 0.6 %; for axisymmetric quadrilaterals that are no
-      parallelograms 0.3 % and 0.9 % next to the axis, where pressures are taken at the mean position of the cell's circles;
+      35 % and increase with the load. Hexahedra that are no parallelepipeds then pass the patch test approximately. With nodes
+      moved by 10 % of a cell's size the error of stresses is 0.08 %, by 25 % 0.6 %. For axisymmetric quadrilaterals that are no
+      parallelograms it is 0.3 % and 0.9 % next to the axis, where pressures are taken at the mean position of the cell's circles;
     - degree 2 on quadrilaterals and hexahedra, 4.2 %: stress at 3 points per direction, pressure at 2; with both at 3 it
       would be 12 %;
     - degree 2 on triangles and tetrahedra, 7.0 %: both by the rule of degree 2, as a single point for the pressure leaves the
@@ -82,7 +82,7 @@ class VonMises(given.Sealed):
         hardening: increase of the yield stress per equivalent plastic strain.
         kinematic_hardening: increase of the back stress in uniaxial tension per plastic strain. Or a table: pairs (plastic strain, back
             stress in uniaxial tension) from (0, 0), with linear interpolation, slopes that do not increase, and a constant beyond the
-            last pair; then ``hardening`` must be 0, and in plane stress ``nu`` below 1/2.
+            last pair. Then ``hardening`` must be 0, and in plane stress ``nu`` below 1/2.
         displacement: number of the displacement's part of the mixed space.
         kind: ``"3d"``, ``"plane_strain"``, ``"plane_stress"``, or ``"axisymmetric"`` on a mesh declared axisymmetric.
         strain: ``"small"``: symmetric gradient and Cauchy stress, or ``"green_lagrange"``: additive split of the Green-Lagrange

@@ -27,10 +27,10 @@ from uem_dolfinx.solve.problem import UnitedProblem
 
 
 def loads_of(problem: UnitedProblem, wanted: bool = True) -> tuple[Array, Array]:
-    """Nodal forces ``(n_owned, gdim)`` of the residual's surface integrals on undeformed bodies, and of its others (collective).
+    """Nodal forces ``(n_owned, gdim)`` of the residual's surface integrals on undeformed bodies, and of its other integrals (collective).
 
-    The latter include stresses, which have no resultant on a body, so that sums over its nodes are resultants of volume loads. Zero unless
-    ``wanted``.
+    Other integrals include stresses, which have no resultant on a body, so that sums over its nodes are resultants of volume loads. Zero
+    unless ``wanted``.
     """
     config, F = problem.config, problem.bodies.F
     found = np.zeros((2, config.n_owned, config.gdim))

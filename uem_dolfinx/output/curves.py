@@ -39,10 +39,10 @@ def plot_history(
         uem.plot_history(history, columns="force_y", over="way")
 
     Args:
-        source: a ``HistoryWriter``, ``ResultsWriter`` or ``EnergyBook``, what ``read_results`` returns, or the path of a CSV file.
+        source: a ``HistoryWriter``, ``ResultsWriter`` or ``EnergyBook``, the result of ``read_results``, or the path of a CSV file.
         picture: name of the picture, or a panel of :func:`figure`. By default the picture is returned, and Jupyter shows it.
-        columns: their names, see the head of the file; None takes all forces and reactions that are not zero, and without any
-            all columns that are not, as the energies of an ``EnergyBook``.
+        columns: their names, see the head of the file; None takes all nonzero forces and reactions, or if there are none all
+            nonzero columns, as the energies of an ``EnergyBook``.
         over: the column on the other axis; None is ``time`` or ``factor``.
         label: of the axis of values; None is the name of a single column.
         over_label: of the other axis; None is ``over``.

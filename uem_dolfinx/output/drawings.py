@@ -22,8 +22,8 @@ from uem_dolfinx.output.frames import Frame, Gathering, Pieces, Shape, grid
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
 
-#: A field that varies by less is the same everywhere, and drawn in one colour; what is outside the window by less is in it; forces that
-#: are less have no arrow, and prescribed values are zero; points that are nearer are one where outlines are looked for.
+#: A field that varies by less is uniform, and drawn in one colour. Points that are outside the window by less are in it; smaller forces
+#: have no arrow, and smaller prescribed values are zero. In searches for outlines nearer points are one.
 #: [convention; largest value, window's size, largest force; test_pictures.py::test_a_field_that_is_the_same_everywhere]
 EVEN = 1e-9
 #: Colours of surfaces without contact pressure, and of rigid surfaces.

@@ -173,7 +173,7 @@ def vertex_values(problem: UnitedProblem, field: Any) -> Array:
     Args:
         problem: the problem.
         field: None for the magnitude of the displacement, or for a scalar u; a contact or several for their pressure; a scalar Lagrange
-            Function; or any other scalar UFL expression, which is averaged over the cells around a vertex.
+            Function. Or any other scalar UFL expression, which is averaged over the cells around a vertex.
     """
     mesh = problem.config.mesh
     if field is None and not problem.config.moves:

@@ -180,7 +180,7 @@ def plot_scene(
         picture: name of the picture, or a panel of :func:`figure` (None on ranks other than 0). By default the picture is returned, and
             Jupyter shows it.
         field: scalar UFL expression, averaged at the nodes of each body; a scalar Lagrange Function, drawn with its values at the
-            vertices; a contact, a general contact, its ``pressure`` or a list of contacts, for their pressure, grey elsewhere and where
+            vertices. Or a contact, a general contact, its ``pressure`` or a list of contacts, for their pressure, grey elsewhere and where
             they are open; None is the magnitude of the displacement.
         label: of the colour bar.
         levels: number of colours, or their bounds.

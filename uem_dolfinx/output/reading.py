@@ -111,7 +111,7 @@ class Results:
 
         Args:
             name: one of ``names``.
-            step: its place in ``times``, -1 the last.
+            step: its index in ``times``, -1 the last.
             shape: of its values; None takes ``(gdim,)`` for vectors and ``(gdim, gdim)`` for tensors, 3 in place of gdim where other
                 components are not zero. XDMF has three for all.
 
@@ -196,7 +196,7 @@ def read_results(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, *, mesh: Any
     Args:
         path: as given to the writer, with or without its ending.
         comm: ranks on which the fields are read.
-        mesh: of the run, whose Functions the fields are to go with; None makes the mesh anew from the files.
+        mesh: of the run, to combine the fields with its Functions; None makes the mesh anew from the files.
         fields: False reads the history alone.
 
     Raises:

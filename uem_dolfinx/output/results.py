@@ -75,8 +75,8 @@ class HistoryWriter(Closing, given.Sealed):
         suffixes, resultant = contact_suffixes(problem.declared), [f"force_{a}" for a in axes] + [f"moment_{a}" for a in turns]
         for suffix in suffixes:
             names += [f"{name}{suffix}" for name in ("active", "max_gap", *resultant)]
-        self._progress, self._asked = problem.progress, Columns(problem, reaction, columns)
-        self.table = CsvTable(path, problem.comm, names + self._asked.names, until, key="step", whose=self._whose)
+        self._progress, self._further = problem.progress, Columns(problem, reaction, columns)
+        self.table = CsvTable(path, problem.comm, names + self._further.names, until, key="step", whose=self._whose)
         self.path = Path(path)
         try:
             self._pairs = PairTables(self.table.path, problem, suffixes, names[0], resultant, resume)
@@ -126,7 +126,7 @@ class HistoryWriter(Closing, given.Sealed):
         for contact in self.problem.declared:
             resultant = contact.resultant()
             row += [contact.n_active, contact.max_gap(), *resultant.force, *resultant.moment]
-        self.table.write(row + self._asked.row())
+        self.table.write(row + self._further.row())
         self._pairs.write(time, self._progress.steps)
 
     def close(self) -> None:

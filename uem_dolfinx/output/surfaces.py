@@ -138,7 +138,7 @@ class SurfaceWriter(Closing, given.Sealed):
         part.replace(self._index)
 
     def close(self) -> None:
-        """Write no more."""
+        """Stop writing."""
         self._closed = True
 
 

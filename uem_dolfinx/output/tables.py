@@ -260,22 +260,22 @@ class Columns:
 
     def __init__(self, problem: UnitedProblem, reaction: Any, quantities: Mapping[str, Callable[[], Any]] | None):
         self._comm, self._axes = problem.comm, "xyz"[: problem.config.gdim]
-        self._asked: dict[str, Callable[[], Any]] = {}
+        self._quantities: dict[str, Callable[[], Any]] = {}
         with agreed(self._comm):
             expected = "functions without arguments that return numbers, by the names of their columns"
             given.kind("columns", quantities, quantities is None or isinstance(quantities, Mapping), expected)
             supports = dict(reaction) if isinstance(reaction, Mapping) else {} if reaction is None else {"": reaction}
             for name, support in supports.items():
                 suffix = f"_{given.name('the name of a reaction', name)}" if isinstance(reaction, Mapping) else ""
-                self._asked[f"reaction{suffix}"] = partial(problem.reaction, support)
+                self._quantities[f"reaction{suffix}"] = partial(problem.reaction, support)
             for name, quantity in (quantities or {}).items():
                 given.name("the name of a column", name)
                 given.kind(
                     f"columns[{name!r}]", quantity, given.function(quantity), "a function without arguments that returns numbers"
                 )
-                if name in self._asked:
+                if name in self._quantities:
                     raise InputError(f"columns[{name!r}]: a reaction has this name: choose another")
-                self._asked[name] = quantity
+                self._quantities[name] = quantity
         self._sizes = {name: value.shape for name, value in self._values().items()}
         self.names = [column for name, shape in self._sizes.items() for column in self._columns(name, shape)]  # of the columns
 
@@ -287,7 +287,7 @@ class Columns:
 
     def _values(self) -> dict[str, Array]:
         """Present values of the functions (collective)."""
-        found = {name: ask_together(self._comm, f"columns[{name!r}]", ask) for name, ask in self._asked.items()}
+        found = {name: ask_together(self._comm, f"columns[{name!r}]", ask) for name, ask in self._quantities.items()}
         with agreed(self._comm):
             for name, value in found.items():
                 what = f"columns[{name!r}]"
@@ -303,7 +303,7 @@ class Columns:
         Raises InputError or InputTypeError if a function returns numbers that are not finite, differ between ranks, or changed in
         number, and UserFunctionError if a function raises an error.
         """
-        if not self._asked:
+        if not self._quantities:
             return []
         values = self._values()
         with agreed(self._comm):

@@ -36,7 +36,7 @@ FORMAT = 8
 MAGIC = "uem_dolfinx checkpoint"
 #: Bytes before the first table. [format; bytes; test_checkpoint_refused.py::test_damaged_files]
 HEAD = 128
-#: How long a rank that leaves a loop waits for the others before it goes on without writing.
+#: How long a rank that leaves a loop waits for the others before it continues without writing.
 #: [bound; seconds; test_left_early.py::test_left_by_one_rank]
 LEAVING = 30.0
 
@@ -57,13 +57,13 @@ def write_checkpoint(path: str | Path, state: State) -> None:
     for hook in state.collect:
         ask_together(comm, "a function in State.collect", hook)
     with timed("write checkpoint"):
-        described, beside = state.describe(), _beside(path)
+        described, incomplete = state.describe(), _incomplete(path)
         trouble = _trouble(comm, f"the checkpoint {path} cannot be written", REMEDY)
         with trouble:
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                beside.unlink(missing_ok=True)
-        file = open_together(beside, trouble, new=True)
+                incomplete.unlink(missing_ok=True)
+        file = open_together(incomplete, trouble, new=True)
         end, tables = HEAD, []
         for entry in state.entries:
             part = entry.numbering.to_table(entry.to_checkpoint())
@@ -83,14 +83,14 @@ def write_checkpoint(path: str | Path, state: State) -> None:
                     file.write_at(offset, np.frombuffer(data, dtype=np.uint8))
         file.close()
         with trouble:
-            flush(beside)
+            flush(incomplete)
         complete = all(comm.allgather(trouble.none))
         with trouble:
             if comm.rank == 0 and complete:
-                os.replace(beside, path)
+                os.replace(incomplete, path)
                 flush(path.parent)
             elif comm.rank == 0:
-                beside.unlink(missing_ok=True)
+                incomplete.unlink(missing_ok=True)
         trouble.agree()
 
 
@@ -146,7 +146,7 @@ def _of_state(path: Any, state: Any) -> tuple[Path, MPI.Comm]:
     return given_path("path", path, state.comm), state.comm
 
 
-def _beside(path: Path) -> Path:
+def _incomplete(path: Path) -> Path:
     """Temporary file of a checkpoint, which replaces the file when complete."""
     return path.with_name(path.name + ".part")
 
@@ -310,7 +310,7 @@ class Checkpoint(given.Sealed):
         )
         with trouble:
             if comm.rank == 0:
-                _beside(self.path).unlink(missing_ok=True)
+                _incomplete(self.path).unlink(missing_ok=True)
                 found = self.path.exists()
         trouble.agree()
         if not comm.bcast(found):

@@ -43,7 +43,7 @@ class Interruption:
     """
 
     def __init__(self, finishing: bool = False) -> None:
-        self._asked, self._depth, self._finishing = 0, 0, finishing
+        self._received, self._depth, self._finishing = 0, 0, finishing
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -65,20 +65,20 @@ class Interruption:
             # other code may have set its own handler since
             if signal.getsignal(number) == self._note:
                 signal.signal(number, before)
-        asked, self._asked = self._asked, 0
-        if asked:
+        received, self._received = self._received, 0
+        if received:
             # the signal has not been acted on
-            signal.raise_signal(asked)
+            signal.raise_signal(received)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self._depth and not self._asked:
-            self._asked = number
+        if self._depth and not self._received:
+            self._received = number
             logger.warning("%s: the run ends after this iteration or step; Ctrl-C ends it at once", signal.Signals(number).name)
             return
         if self._depth and number == signal.SIGTERM:
             # some senders signal both the process and its group
             return
-        self._asked, before = 0, self._before[number]
+        self._received, before = 0, self._before[number]
         if callable(before):
             before(number, frame)
         else:
@@ -87,9 +87,9 @@ class Interruption:
 
     def agreed(self, comm: MPI.Comm) -> int:
         """Number of a signal that any rank has received since the last call, 0 without one (collective)."""
-        number = int(reduced(comm, self._asked, op=MPI.MAX))
+        number = int(reduced(comm, self._received, op=MPI.MAX))
         if number:
-            self._asked = 0
+            self._received = 0
         return number
 
     def check_signals(self, comm: MPI.Comm) -> None:

@@ -78,7 +78,7 @@ def node_numbering(V: Any) -> Numbering:
     """Numbering of a space's owned nodes (blocks of d.o.f.), by their first cell in the input (collective).
 
     The order of a cell's vertices is the same in every partition, and so is the order of its nodes if edges and facets have at most one
-    inner node each; otherwise it depends on global numbers of vertices. So only Lagrange spaces of degree 1 or 2, discontinuous Lagrange
+    inner node each. Otherwise it depends on global numbers of vertices. So only Lagrange spaces of degree 1 or 2, discontinuous Lagrange
     and quadrature spaces are supported, with values of any shape; others raise a CheckpointError.
     """
     comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, compat.cell_dofs(V)

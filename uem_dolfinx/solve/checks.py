@@ -132,8 +132,8 @@ def check_materials(materials: Any, F: ufl.Form, u: fem.Function, displacement: 
             raise SpaceError(f"{name} is of displacement={part}: expected the problem's part of u; make it with {displacement=}")
     fields = {id(law): f for f in F.coefficients() if (law := material_of(f)) is not None}
     for i, material in enumerate(found):
-        tells = any(material_of(f) is material for f in material.history.values())
-        if fields.pop(id(material), None) is None and tells:
+        identified = any(material_of(f) is material for f in material.history.values())
+        if fields.pop(id(material), None) is None and identified:
             raise InputError(
                 f"F is not made of materials[{i}], {given.described(material)}: expected a term material.residual(v) in F"
             )

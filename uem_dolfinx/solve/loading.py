@@ -176,7 +176,7 @@ def ramped(load: Any, bcs: Sequence[Any], start: Array, wanted: Array, fraction:
 DEPTH = 4
 
 
-def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load", beside: Sequence[Any] = ()) -> None:
+def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load", further: Sequence[Any] = ()) -> None:
     """Refuse Constants in a load that do not occur in the problem (collective).
 
     Args:
@@ -184,7 +184,7 @@ def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load",
         load: as returned by ``check_load``.
         bcs: Dirichlet conditions, whose values may be the Constants.
         what: name of the load in the message.
-        beside: other objects and functions that may contain them, e.g. objects in a step.
+        further: other objects and functions that may contain them, e.g. objects in a step.
 
     Raises:
         InputError: names the first of them.
@@ -200,7 +200,7 @@ def refuse_idle(problem: Any, load: Any, bcs: Sequence[Any], what: str = "load",
         if follows or any(c is one for one in in_forms):
             continue
         others = [value for constant, value in load.items() if constant is not c]
-        found = any(holds(one, c) for one in (parts, others, beside))
+        found = any(holds(one, c) for one in (parts, others, further))
         if not reduced(problem.comm, found, op=MPI.LOR):
             now = given.shown(np.asarray(c.value).tolist())
             raise InputError(

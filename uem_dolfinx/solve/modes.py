@@ -2,7 +2,7 @@
 
 Harmonics of cyclic parts: vibrations of a whole ring, of a nodal diameter k, by one of its N sectors.
 
-The displacement ``u = a + i b`` of a sector goes over into that of the next one by the rotation R and the phase ``t = 2 pi k / N``, so
+The displacement ``u = a + i b`` of a sector is mapped to that of the next one by the rotation R and the phase ``t = 2 pi k / N``, so
 that nodes of the cut that follows have ``u = e^(it) R u(leader)`` instead of ``R u(leader)``. With P for the phase 0, and its rows D P of
 these nodes,
 

@@ -3,8 +3,8 @@
 The check uses the converged step, not the Newton iterates: straight paths of contactors and target from the committed to the new
 configuration. A contactor passes if it enters the target through one face and leaves it through another that faces away from the first.
 Contactors that only cut an edge or a crest, or slide past an end, are accepted in statics; in dynamics they have missed an
-impact. A contactor that touches at the end of the step has reached the wrong face in two cases: it comes from behind this face,
-or from the sector in front of both faces of an edge. In the second case its straight path does not determine which face it meets.
+impact. A contactor that touches at the end of the step has reached the wrong face if it comes from behind this face, or from
+the sector in front of both faces of an edge. In the second case its straight path does not determine which face it meets.
 
 For a body that may touch itself, paths are straight relative to its facets, and each facet rotates with its surroundings. So a body that
 rotates, rolls or bends does not approach itself, and the surface around a facet moves with it.
@@ -66,7 +66,7 @@ def refuse_passages(
     """
     du = config.displacement - config.of(start)
     # nothing that could pass is on an empty list
-    may = [slides(pair) and (pair.asked or not _listed(pair.target)) for pair in pairs]
+    may = [slides(pair) and (pair.in_reach or not _listed(pair.target)) for pair in pairs]
     looked_at = list(compress(zip(pairs, motions), may))
     ways = [_ways(pair, du, motion) for pair, motion in looked_at]
     # for each contact: the longest displacements of both sides, the sum of the target's displacements and their number
@@ -171,7 +171,7 @@ def _inside(found: Crossings, way: Array, reach: float, at_all: Bools) -> tuple[
         at_all: mask of contactors that pass if they leave by any face ``(n,)``; others pass if the face looks away.
 
     Returns:
-        Crossings by which passing contactors enter, crossings by which others leave without having entered, and the former's depths.
+        Crossings by which passing contactors enter, crossings by which others leave without having entered, and the depths of entries.
     """
     from uem_dolfinx.geometry.crossings import entries_and_exits
 
@@ -242,14 +242,14 @@ def _came_from(pair: Interface, target: MeshTarget, start: Array) -> tuple[Array
             nearest, touched = target.project(x, new), target.project_on(x, pair.kinematics.projection.facet[new])
         behind[new] = np.where(nearest.gap >= 0.0, -touched.gap, 0.0)
         outward, away = target.outward(nearest), x - nearest.foot
-        beside = np.linalg.norm(away - _dot(away, outward)[:, None] * outward, axis=1) > PASSAGE_DEPTH * target.stride
-        beside &= ~(nearest.beyond != 0.0).any(axis=1)
+        lateral = np.linalg.norm(away - _dot(away, outward)[:, None] * outward, axis=1) > PASSAGE_DEPTH * target.stride
+        lateral &= ~(nearest.beyond != 0.0).any(axis=1)
         # the mean normal at an edge is inclined to the normals of both faces
         sharp = to_mean(SHARP_EDGE)
         normal = target.outward(touched)
         # from a face in front of the touched face, contactors come along a concave edge or across free space
         turned = (_dot(normal, outward) < sharp) & (_dot(nearest.foot - touched.foot, normal) <= PASSAGE_DEPTH * target.stride)
-        other = (beside & (_dot(nearest.averaged, outward) < sharp)) | turned
+        other = (lateral & (_dot(nearest.averaged, outward) < sharp)) | turned
         way = np.linalg.norm(x - touched.foot, axis=1)
         unsure[new] = np.where(other & (way > target.stride) & (nearest.facet >= 0), way, 0.0)
     return behind, unsure

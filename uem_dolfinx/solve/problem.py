@@ -88,8 +88,8 @@ class UnitedProblem(given.Sealed):
     Raises:
         InputError, InputTypeError: for an argument of another type or out of its range, with its name and value; on all ranks.
         SpaceError: if ``u``, or its part ``displacement``, is no vector Lagrange Function of the mesh's dimension, or F does not
-            depend on it; if a Dirichlet condition, the test function or a law with history is of another space or displacement;
-            if F contains objects of another mesh, or a contact belongs to another problem.
+            depend on it. If a Dirichlet condition, the test function or a law with history is of another space or displacement. If F
+            contains objects of another mesh, or a contact belongs to another problem.
         MeshError: if the coordinates of a node are not finite, with the node.
         TagError, SurfaceError, OrientationError, PenetrationError: see ``Contact``.
         KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM meanwhile.
@@ -147,8 +147,8 @@ class UnitedProblem(given.Sealed):
                 others = {"materials": materials, "dynamics": dynamics, "points": points, "couplings": couplings}
                 check_ties(self.config.gdim, contacts, **others)
             self.materials = checks.check_materials(materials, F, u, displacement)
-            beside = {"equations": equations, "couplings": linked}
-            self.dynamics = checks.check_dynamics(dynamics, contacts, beside, displacement is None and method is BodySystem)
+            constraints = {"equations": equations, "couplings": linked}
+            self.dynamics = checks.check_dynamics(dynamics, contacts, constraints, displacement is None and method is BodySystem)
             if J is not None:
                 check_bilinear("J", J, u.function_space)
             jit_options = given.kind("jit_options", jit_options or {}, isinstance(jit_options, Mapping | None), "a dictionary")

@@ -49,7 +49,7 @@ class Settings:
         contacts: of the problem.
         materials: of the problem.
         dynamics: of the problem, or None.
-        beside: words for further settings, by name.
+        words: words for further settings, by name.
     """
 
     def __init__(
@@ -59,11 +59,11 @@ class Settings:
         contacts: Sequence[Contact],
         materials: Sequence[Any],
         dynamics: Dynamics | None,
-        beside: Mapping[str, str],
+        words: Mapping[str, str],
     ):
         self.forms, self._contacts, self._dynamics = forms, contacts, dynamics
         #: Words that are the same on all ranks, and values described by their range over all ranks, by name.
-        self._words: dict[str, str] = dict(beside)
+        self._words: dict[str, str] = dict(words)
         self._values: dict[str, Array] = {}
         #: Words of settings with default values, by name.
         self._usual: dict[str, str] = {}
@@ -219,6 +219,6 @@ def newton_of(newton: Any, **others: Any) -> Newton:
         given.word("newton", newton, ("full", "modified"))
         return Newton(method=newton, **others)
     defaults = {one.name: one.default for one in fields(Newton)}
-    if beside := [name for name, value in others.items() if value is not defaults[name] and value != defaults[name]]:
-        raise InputError(f"{beside[0]} is given in addition to newton, a Newton: expected it there, uem.Newton({beside[0]}=...)")
+    if twice := [name for name, value in others.items() if value is not defaults[name] and value != defaults[name]]:
+        raise InputError(f"{twice[0]} is given in addition to newton, a Newton: expected it there, uem.Newton({twice[0]}=...)")
     return newton

@@ -200,7 +200,7 @@ class Edges(OnTarget):
         crossings.update()
         which, found = crossings.lists[k]
         near = bool(len(which) or state.active.any())
-        self.asked = bool(reduced(self.config.comm, near, op=MPI.LOR))
+        self.in_reach = bool(reduced(self.config.comm, near, op=MPI.LOR))
         return EdgeKinematics.of_crossings(self, points, which, found)
 
     def commit(self) -> None:

@@ -6,7 +6,7 @@ the direction s moves as without friction. If its limit is ``b + mu lambda``, b 
 
     trial  n . (du_i - sum_a N_a du_a) = -g,        test  (n - mu s) . (dv_i - sum_a N_a dv_a) = 0,
 
-so that the contact force ``lambda (n - mu s)`` does no work on the virtual motions Q. In 3D the direction follows the motion: with
+so that the contact force ``lambda (n - mu s)`` does no work on the virtual motions Q. In 3D the direction follows the motion. With
 the tangential force tau and the slip w since the last step, ``q = c w - tau`` has the direction ``s = q / |q|`` wherever
 ``tau = -mu lambda s`` and w is along s, whatever the stiffness c is (semismooth Newton: Alart and Curnier, 1991,
 doi:10.1016/0045-7825(91)90022-X; Hüeber, Stadler and Wohlmuth, 2008, doi:10.1137/060671061).
@@ -76,7 +76,7 @@ class LastStep:
 #: [convention; a unit vector; test_friction_states.py::test_tangents_in_free_components]
 PRESCRIBED = 1e-6
 #: Slip with a smaller part along free components is along prescribed ones.
-#: [convention; a unit vector; test_prescribed_to_and_fro.py::test_slip_along_conditions_goes_on]
+#: [convention; a unit vector; test_prescribed_to_and_fro.py::test_slip_along_conditions_continues]
 ALONG_CONDITIONS = 0.5
 #: The stiffness c of a contactor that slips in space, as part of that of both bodies: from 1 on directions of slip go in circles.
 #: [heuristic; the diagonal of K; test_friction_moving_targets.py::test_a_slender_block_on_a_turntable]

@@ -9,7 +9,7 @@ from dolfinx import fem
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Indices
-from uem_dolfinx.contact.laws.law import Field, asked_at
+from uem_dolfinx.contact.laws.law import Field, evaluated_at
 from uem_dolfinx.contact.mortar.duals import basis_of
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import InputError
@@ -20,8 +20,8 @@ from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.log import logger
 from uem_dolfinx.parallel import reduced
 
-#: A step wears too much where its depth, times the contactor's stiffness, is more than this times the force that it is worn under: the
-#: force then overshoots in the next step, and neighbours take turns in bearing (explicit Euler's bound).
+#: A step wears too much where its depth, times the contactor's stiffness, is more than this times its contact force. The force then
+#: overshoots in the next step, and neighbours alternate in carrying it (explicit Euler's bound).
 #: [derived; force along the normal; test_wear.py::test_steps_that_wear_too_much]
 MOST_WORN = 2.0
 
@@ -61,7 +61,7 @@ class Wear:
         given.kind(words, k, not isinstance(k, fem.Function), "a number or a function of position")
         self._config, self._nodes, self._lower, self._name, self._warned = config, nodes, lower, name, False
         #: coefficient at the contactors ``(n,)``.
-        self.k = asked_at(config, nodes, words, k, given.NOT_NEGATIVE) if callable(k) else np.full(len(nodes), k)
+        self.k = evaluated_at(config, nodes, words, k, given.NOT_NEGATIVE) if callable(k) else np.full(len(nodes), k)
         surface = TargetFacets(config, tag, "contactor")
         #: Integrals of the shape functions at the contactors ``(n,)``.
         self._areas: Array = areas.reference[nodes]

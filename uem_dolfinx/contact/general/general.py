@@ -49,8 +49,8 @@ class GeneralContact(ManyContacts, given.Sealed):
         rigid: rigid surfaces that all of them may touch: one, or a list.
         exclude: parts without contact, and pairs of parts ``(one, other)`` without contact between them, of facets or of cells.
             Surfaces paired by another ``Contact`` of the problem are left to it; its tied nodes have no contact next to the tie.
-        order: parts, of facets or of cells, whose bodies' nodes follow all later ones; other bodies come after these, the finer
-            first, of equally fine ones the smaller, those that couplings or Dirichlet conditions make rigid last.
+        order: parts, of facets or of cells, whose bodies' nodes are contactors to all later ones. Other bodies come after
+            these: the finer first, of equally fine ones the smaller, and last bodies that couplings or Dirichlet conditions make rigid.
         self_contact: parts, of facets or of cells, whose bodies may touch themselves; True is all, False none.
         bodies: names of bodies, ``{name: part}`` with parts of facets or of cells; others are ``"body 1"``, ``"body 2"``, ... in the
             order of the mesh's input.
@@ -65,7 +65,7 @@ class GeneralContact(ManyContacts, given.Sealed):
         name: for messages and files.
         normal: see ``Contact``; its pressure must be 0 from a gap of half a facet on. Only nearest facets press.
         heat: see ``Contact``; heat flows only where surfaces touch, with a ``temperature`` also into rigid surfaces. Or a list.
-        edges: whether sharp edges of different bodies that cross are held apart in 3D, by one equation at each crossing; None:
+        edges: whether sharp edges of different bodies that cross in 3D are in contact, by one equation at each crossing; None:
             if supported, without ``normal``, ``heat`` and laws of friction by area. With mortar, where edges are ridges.
         others: further arguments of ``Contact``, such as ``cohesion`` and ``leak``, at their defaults only.
 

@@ -98,7 +98,7 @@ class BodiesContact(GeneralPart):
         """Values by the body opposite to contactors ``(n,)``; None if they do not depend on it (collective)."""
         if self._by_pairs is None:
             return super()._friction_now(kinematics)
-        return None if not self.pair.asked else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
+        return None if not self.pair.in_reach else self._by_pairs.now(self.on_skin(kinematics.projection.facet))
 
     @property
     def watches_ends(self) -> bool:
@@ -142,7 +142,7 @@ class AmongContact(BodiesContact):
     def pressing(self) -> tuple[Array, Array]:
         """Forces, including forces from nodes of the other body that follow this node at sharp edges (collective)."""
         (across, along), pair = super().pressing(), self.pair
-        if not pair.asked:
+        if not pair.in_reach:
             return across, along
         received, normal, spread = self._received(), pair.kinematics.projection.normal, pair.discretisation.spread
         pressing = np.einsum("ng,ng->n", received, normal)
@@ -164,7 +164,7 @@ class AmongContact(BodiesContact):
     def _received(self) -> Array:
         """Forces ``(n, gdim)`` by nodes of the touched body that follow active contactors, where one is at a sharp edge (collective)."""
         skin, config, parts = self._skin, self.config, []
-        for pair in (one.pair for one in self._together if one.pair.asked):
+        for pair in (one.pair for one in self._together if one.pair.in_reach):
             row, node, weight = pair.kinematics.means()[1]
             own = np.flatnonzero(pair.trial.active[row])
             row, i = row[own], pair.nodes[row[own]]

@@ -158,7 +158,7 @@ SOFTENINGS: dict[str, type[Softening]] = {"bilinear": Bilinear, "exponential": E
 
 
 class Cohesive(given.Sealed):
-    """Cohesion of two surfaces that separate at a strength, and take an energy per area to be separated.
+    """Cohesion of two surfaces, with a strength and an energy per area of full separation.
 
         uem.Cohesive(strength=30e6, energy=260.0)
         uem.Cohesive(30e6, 260.0, shear_strength=60e6, shear_energy=1000.0, mixed=uem.BenzeggaghKenane(2.1))
@@ -171,7 +171,7 @@ class Cohesive(given.Sealed):
         shear_energy: of a full separation in shear; None is ``energy``.
         mixed: a law between the two, ``BenzeggaghKenane`` or ``Power``; None if both have the same values.
         law: ``"bilinear"`` or ``"exponential"`` softening.
-        unloading: ``"origin"``, elastic with the damaged stiffness, or ``"plastic"``, with the first stiffness to a permanent opening.
+        unloading: ``"origin"``, elastic with the damaged stiffness, or ``"plastic"``, with the initial stiffness to a permanent opening.
         stiffness: before damage, a traction over a length; None is 100 times the least, ``strength^2 / (2 energy)``.
         viscosity: time, in statics part of the load factor, by which damage is delayed; helps where equilibrium jumps.
 
@@ -239,7 +239,7 @@ class Cohesive(given.Sealed):
         beyond = size.real > (strength / self.stiffness).real
         return np.where(beyond, 1.0 - t / (self.stiffness * np.where(beyond, size, 1.0)), 0.0)
 
-    def respond(self, w: Array, normal: Array, kept: Response, passed: Array | float, goes_on: Bools | bool = False) -> Response:
+    def respond(self, w: Array, normal: Array, kept: Response, passed: Array | float, growing: Bools | bool = False) -> Response:
         """Tractions on openings.
 
         Args:
@@ -247,7 +247,7 @@ class Cohesive(given.Sealed):
             normal: unit normals along which surfaces open ``(n, gdim)``.
             kept: of the last step.
             passed: time, or part of the load factor, since then, one or ``(n,)``.
-            goes_on: whether the tangent is that of growing damage although it has not grown ``(n,)``; with unloading to the origin.
+            growing: whether the tangent is that of growing damage although it has not grown ``(n,)``; with unloading to the origin.
         """
         plastic = self.unloading == "plastic"
         e = w - kept.permanent if plastic else w
@@ -272,7 +272,7 @@ class Cohesive(given.Sealed):
         if plastic:
             return self._yield(e, m, P, size, share, slopes, kept)
         damage, slope = slopes(self._damage)
-        grows = (damage > kept.damage) | goes_on
+        grows = (damage > kept.damage) | growing
         damage = np.maximum(damage, kept.damage)
         follows = passed / (passed + self.viscosity) if self.viscosity > 0.0 else 1.0
         delayed = (1.0 - follows) * kept.delayed + follows * damage

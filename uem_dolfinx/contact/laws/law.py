@@ -53,7 +53,7 @@ class OfTemperature(given.Sealed):
         return OfTemperature(lambda x, _, T: self.f(x, t, T), field=self.field)
 
 
-#: A number, or a function of position, called with reference points ``(3, n)``, that returns ``(n,)``; or a function of position
+#: A number, or a function of position, called with reference points ``(3, n)``, that returns ``(n,)``. Or a function of position
 #: and of load factor or time that returns ``(n,)`` or a number; or a scalar ``fem.Function`` of the displacement's nodes; or an
 #: ``OfTemperature``.
 Field: TypeAlias = float | Callable[..., npt.ArrayLike]
@@ -230,7 +230,7 @@ def parameters(law: FrictionLaw) -> list[Any]:
 
 
 def is_of_position(field: Field) -> bool:
-    """Whether a field is a function of position, whose values at nodes change where these are moved; a Function goes with its nodes."""
+    """Whether a field is a function of position, whose values at nodes change where these are moved; a Function moves with its nodes."""
     return callable(field) and not isinstance(field, fem.Function)
 
 
@@ -248,8 +248,8 @@ def follows_load(law: FrictionLaw) -> bool:
     except (TypeError, ValueError):
         # a C function without signature
         return False
-    asked = [a for a in arguments if a.default is a.empty and a.kind in (a.POSITIONAL_ONLY, a.POSITIONAL_OR_KEYWORD)]
-    return len(asked) == 2
+    required = [a for a in arguments if a.default is a.empty and a.kind in (a.POSITIONAL_ONLY, a.POSITIONAL_OR_KEYWORD)]
+    return len(required) == 2
 
 
 def values_at(
@@ -283,11 +283,11 @@ def values_at(
     if not callable(law.field):
         return np.full(n, law.field) if law.field > 0 else None
     words, more = f"contact '{name}': friction", ((at,) if T is None else (at, T)) if follows_load(law) else ()
-    value = asked_at(config, nodes, words, law.field, given.NOT_NEGATIVE, *more)
+    value = evaluated_at(config, nodes, words, law.field, given.NOT_NEGATIVE, *more)
     return value if more or isinstance(law.field, fem.Function) or reduced(config.comm, int((value > 0).any())) else None
 
 
-def asked_at(
+def evaluated_at(
     config: Configuration, nodes: Indices, words: str, f: Callable[..., npt.ArrayLike], within: given.Range, *more: Any
 ) -> Array:
     """Values of a field, named by ``words``, at ``nodes (n,)``: ``(n,)`` (collective).

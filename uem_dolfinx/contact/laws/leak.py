@@ -16,12 +16,12 @@ class Leak(given.Sealed):
     """Fluid between contactors and target, which presses on both; pass it to ``Contact`` as ``leak``.
 
     The fluid reaches the contactors of ``inlet``, and from open contactors their neighbours. A contactor that it reaches and that is closed
-    carries the fluid's pressure, and in addition a contact pressure that is not negative: it opens as soon as the fluid's pressure exceeds
-    what presses the surfaces together. ``contact.pressure`` is the part of the solids, :attr:`Contact.wet` shows where the fluid is.
+    carries the fluid's pressure, and in addition a contact pressure that is not negative. It opens as soon as the fluid's pressure exceeds
+    the pressure that closes the surfaces. ``contact.pressure`` is the part of the solids, :attr:`Contact.wet` shows where the fluid is.
 
     Args:
         pressure: of the fluid, a number that is not negative, or a function of the load factor, in dynamics of the time.
-        inlet: where it comes from: a part of the mesh whose nodes on the contactor surface it always reaches.
+        inlet: source of the fluid: a part of the mesh whose nodes on the contactor surface it always reaches.
 
     Raises:
         InputError, InputTypeError: for a pressure that is negative or of another type.

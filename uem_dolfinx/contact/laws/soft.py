@@ -85,7 +85,7 @@ class SoftContact(given.Sealed):
 
     Args:
         p: stiffness per area, a number or a Constant; or a law, ``Exponential`` or ``PowerLaw``; or a table of at least two gaps, in
-            ascending order, with their pressures; or a function of gaps ``(n,)``, negative where surfaces overlap, that returns
+            ascending order, with their pressures. Or a function of gaps ``(n,)``, negative where surfaces overlap, that returns
             pressures ``(n,)``. Pressures are 0 or positive and do not increase with the gap.
         slope: derivative of a function p by the gap, ``(n,)``; None computes it from differences.
         damping: pressure per speed at which surfaces in contact approach each other, in addition to p(g); the sum is never negative.

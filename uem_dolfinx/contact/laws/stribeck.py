@@ -97,7 +97,7 @@ class Thirion:
 
 @dataclass(frozen=True, init=False)
 class ViscousFriction:
-    """Where surfaces touch, slip with the speed v is opposed by the traction ``eta v``, per reference area; nothing sticks.
+    """Where surfaces touch, slip with the speed v is opposed by the traction ``eta v``, per reference area, without sticking.
 
         tau = min(eta v, mu p)
 

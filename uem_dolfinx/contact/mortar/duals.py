@@ -25,7 +25,7 @@ from uem_dolfinx.geometry.shapes import FacetShape
 #: The dual function of a node is added to another's where less than this part of the node's share of a facet is covered.
 #: [convention; part of the integral; test_duals.py::test_what_is_hardly_covered]
 HARDLY_COVERED = 0.05
-#: One that had its own before keeps it as long as more than this part is covered: where the target ends on what moves with the forces,
+#: One that had its own before keeps it as long as more than this part is covered. Where the target ends on what moves with the forces,
 #: it would else be added and taken back for ever.
 #: [convention; part of the integral; test_mortar.py::test_dual_functions_are_kept]
 STILL_COVERED = 0.01

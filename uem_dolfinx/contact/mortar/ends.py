@@ -132,8 +132,8 @@ class _Ends:
         steep, high = (np.einsum("qfg,qg->qf", tangent, direction) for direction in (s.t, n))
         rise, sinks = 2 * s.gap_changes(n, size), s.motions.along(n)
         for f in range(at.shape.dim):
-            goes = -s.motions.along(over[:, f])
-            rise, sinks = rise + steep[:, f, None, None] * goes, sinks + high[:, f, None, None] * goes
+            motion = -s.motions.along(over[:, f])
+            rise, sinks = rise + steep[:, f, None, None] * motion, sinks + high[:, f, None, None] * motion
         if at.offsets is not None:
             for f, slope in enumerate(np.einsum("qaf,qa->fq", tab.dN, at.offsets[e])):
                 rise = rise + slope[:, None, None] * s.motions.along(over[:, f])
@@ -148,11 +148,11 @@ class _Ends:
             half += sum_of_products(s.pair, s.weight * h, wider, v, k)
         weight = s.weight * h
         for f in range(at.shape.dim):
-            goes = -s.motions.along(over[:, f])
-            half += sum_of_products(s.pair, 0.5 * s.weight * of_b[:, f], v, goes, k)
+            motion = -s.motions.along(over[:, f])
+            half += sum_of_products(s.pair, 0.5 * s.weight * of_b[:, f], v, motion, k)
             spread = np.zeros(v.shape)
             spread[:, : s.motions.nc] = tab.dN[:, :, f, None] * s.outward[:, None]
-            half -= sum_of_products(s.pair, weight, spread, goes, k)
+            half -= sum_of_products(s.pair, weight, spread, motion, k)
         half += sum_of_products(s.pair, weight / size, sinks, s.motions.of_area(s.outward), k)
         if at.shape.dim == 1:
             return half

@@ -83,9 +83,9 @@ class SegmentPoints:
 
     @cached_property
     def stretching(self) -> Array:
-        """How the part of the plane that a point stands for grows with the contactor facet's nodes beside the facet ``(q, nc, gdim)``.
+        """Growth of a point's part of the plane with motions of the contactor facet's nodes along the facet ``(q, nc, gdim)``.
 
-        Of affine facets all parts grow alike, but for circles.
+        All parts of affine facets grow in the same proportion, except on circles.
         """
         grown = self.stretching_at(self.facet[self.segments.pair], self.shape.tabulate(self.segments.xi))
         if self.radius is not None:

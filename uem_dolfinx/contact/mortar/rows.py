@@ -55,7 +55,7 @@ def _over(values: Array, by: Array) -> Array:
     return np.where(by > 0, values / np.where(by > 0, by, 1.0), 0.0)
 
 
-#: Facets around a node that are told apart by the bits of one number; further ones are told apart at their other nodes.
+#: Facets around a node that are distinguished by the bits of one number; further ones are distinguished at their other nodes.
 #: [bound; bits; -]
 MOST_BITS = 52
 

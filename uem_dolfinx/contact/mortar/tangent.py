@@ -10,8 +10,8 @@ An offset is part of what is open, and of no height: areas grow with gaps less i
 
 Where a segment ends at a side between two target facets, gaps are continuous but their slopes are not: the motion of this side counts
 in the second derivatives. The ends of the target move too, and dual functions with them (``mortar_ends``). Parts of quadratic
-facets do not all grow as these do, and change dual functions as ends do. Their sides may be no chords, at which segments end: gaps of
-two target facets differ there, and the contactor's points move past the chords of their own facet as past an end of the target.
+facets do not all grow as these do, and change dual functions as ends do. Their sides may be no chords, at which segments end. Gaps of
+two target facets then differ there, and the contactor's points move past the chords of their own facet as past an end of the target.
 """
 
 from __future__ import annotations

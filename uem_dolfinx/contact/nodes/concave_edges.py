@@ -288,14 +288,14 @@ class ConcaveEdges:
         alone = np.full_like(together, -1)
         alone[:, 0] = number[i]
         for others, allowed in ((together, ~full), (alone, (state.held[i] >= 0).any(axis=1) | full)) if some[0] else ():
-            ask = np.flatnonzero(allowed & ~taken)
-            c = self._corners_of(state, points, i[ask], others[ask])
+            candidate = np.flatnonzero(allowed & ~taken)
+            c = self._corners_of(state, points, i[candidate], others[candidate])
             if c is None:
                 continue
             at_once = (state.changes[c.which] >= HOLD_AFTER) | (c.rising > SHARP)
             hold = c.concave & self._can_be_held(c) & at_once
-            held[c.which[hold]] = others[ask[hold]]
-            taken[ask[hold]] = True
+            held[c.which[hold]] = others[candidate[hold]]
+            taken[candidate[hold]] = True
             changes[c.which[~c.flat]] += 1
             entered |= bool(hold.any())
         switch = i[~taken]
@@ -319,13 +319,13 @@ class ConcaveEdges:
         """
         none = np.full((len(which), self.config.gdim - 1), -1)
         none[:, 0] = across = self.target.project(nearest.foot[which] + ACROSS * nearest.from_middle[which], which).facet
-        ask = np.flatnonzero((across >= 0) & (across != state.facet[which]))
-        c = self._corners_of(state, points, which[ask], none[ask])
+        candidate = np.flatnonzero((across >= 0) & (across != state.facet[which]))
+        c = self._corners_of(state, points, which[candidate], none[candidate])
         if c is None:
             return which[:0], none[:0]
         heights = np.einsum("kjg,kg->kj", c.normals[:, :2], points[c.which] - c.foot)
         alike = np.abs(heights[:, 0] - heights[:, 1]) <= EQUALLY_NEAR * nearest.facet_size[c.which]
-        hold = ask[c.concave & alike & self._can_be_held(c)]
+        hold = candidate[c.concave & alike & self._can_be_held(c)]
         return which[hold], none[hold]
 
     def _corners_of(self, state: PairState, points: Array, which: Ints, others: Ints) -> Corners | None:
@@ -335,8 +335,8 @@ class ConcaveEdges:
 
     def _can_be_held(self, c: Corners) -> Bools:
         """Corners whose contactor has a free direction for every facet ``(k,)``."""
-        asked = np.arange(self.config.gdim) < c.count[:, None]
-        A = np.where(asked[:, :, None], c.axes * self._of.free[c.which][:, None, :], 0.0)
+        used = np.arange(self.config.gdim) < c.count[:, None]
+        A = np.where(used[:, :, None], c.axes * self._of.free[c.which][:, None, :], 0.0)
         return (np.linalg.svd(A, compute_uv=False) > MOSTLY_PRESCRIBED).sum(axis=1) == c.count
 
 

@@ -87,8 +87,8 @@ class NodeToSurface(OnTarget):
 
     def place(self, points: Array, state: PairState) -> NodalKinematics:
         """Project contactors (collective); see ``Discretisation``."""
-        self.asked = self._asks(state)
-        if not self.asked:
+        self.in_reach = self._asks(state)
+        if not self.in_reach:
             return self.nowhere(points)
         corners = None
         if self.sliding == "finite":

@@ -39,7 +39,7 @@ class AdhesiveInterface(SofteningInterface):
     def project(self) -> None:
         """See ``Interface``; the law gives the attraction there (collective)."""
         super().project()
-        if self.trial.cohesion is None or not self.asked:
+        if self.trial.cohesion is None or not self.in_reach:
             self._pull = self._stiffness = np.zeros(len(self.nodes))
             return
         share = self.kinematics.pressure_map(False).force

@@ -23,8 +23,8 @@ from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.contact.ties.bonds import Bonds
 from uem_dolfinx.parallel import reduced
 
-#: Columns of the state: damage, delayed damage, the load factor or time that it belongs to, and whether damage has grown in the last step;
-#: the permanent opening and the normal of the next step follow.
+#: Columns of the state: damage, delayed damage, the load factor or time that it belongs to, and whether damage has grown in the last step.
+#: The permanent opening and the normal of the next step follow.
 DAMAGE, DELAYED, AT, GREW, PERMANENT = range(5)
 
 
@@ -91,8 +91,8 @@ class CohesiveInterface(SofteningInterface):
         w = self._bonds.openings() - taken
         self._first = w if self._first is None else self._first
         # as long as bonds have not moved, those that have grown in the last step are expected to grow on
-        goes_on = (before[:, GREW] > 0.0) & (w == self._first).all(axis=1)
-        now = self._law.respond(w, normal, kept, passed, goes_on)
+        growing = (before[:, GREW] > 0.0) & (w == self._first).all(axis=1)
+        now = self._law.respond(w, normal, kept, passed, growing)
         share = np.where(self._bonds.rows.share > 0.0, self._bonds.rows.share, 1.0)
         area = self._bonds.bonded_areas(self._contact._areas)[:, None]
         self._bonds.press(-area * now.traction / share, (area[:, 0] > 0.0) & (now.delayed < 1.0))

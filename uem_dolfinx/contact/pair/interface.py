@@ -79,11 +79,11 @@ class Interface:
 
         Raises NotFiniteError if the target's functions return values that are not finite.
         """
-        if (self.far and not self.asked) or (self.tie is not None and not self.tie.begin_placement()):
+        if (self.far and not self.in_reach) or (self.tie is not None and not self.tie.begin_placement()):
             return
         known = hasattr(self, "kinematics")
         self.kinematics = self.discretisation.place(self.points, self.trial)
-        if known and not self.asked:
+        if known and not self.in_reach:
             none, united = np.zeros(len(self.nodes)), sum(heat.law.perfect for heat in self.heats)
             heat = np.zeros((len(none), united)) if united else None
             self.set_forces(Traction(none, none, np.zeros(self.points.shape), heat=heat))
@@ -285,7 +285,7 @@ class Interface:
         if self.far:
             return
         if self.friction is not None:
-            if not self.asked:
+            if not self.in_reach:
                 self.friction.place(self.kinematics, self.trial)
             self.trial = self.friction.commit(self.trial, self.committed, self.kinematics)
         inside, ends = self.kinematics.projection.gap < 0, self.kinematics.ends
@@ -336,9 +336,9 @@ class Interface:
         return self
 
     @property
-    def asked(self) -> bool:
+    def in_reach(self) -> bool:
         """Whether any contactor on any rank was near the target in the last placement."""
-        return self.discretisation.asked
+        return self.discretisation.in_reach
 
     @property
     def far(self) -> bool:
@@ -410,7 +410,7 @@ class Interface:
 
 def in_question(pairs: Sequence[Interface]) -> list[Interface]:
     """Pairs with a contactor near the target on any rank; in an iteration, the other pairs are only placed."""
-    return [pair for pair in pairs if pair.asked]
+    return [pair for pair in pairs if pair.in_reach]
 
 
 def motions_of(pairs: Sequence[Interface]) -> list[Motion | None]:

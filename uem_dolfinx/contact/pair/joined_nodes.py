@@ -68,7 +68,7 @@ class JoinedNodes(NodeToSurface):
         for one in getattr(self, "_own", ()) if "free" in changed else ():
             one.set(free=changed["free"])
         if "far" in changed and self.target.n_nodes:
-            self.target.asked = ~changed["far"][self.setting.label]
+            self.target.projected = ~changed["far"][self.setting.label]
 
     def overhanging(self, projection: Projection, which: Bools) -> Bools:
         """See ``NodeToSurface``: by the facets of each contact."""
@@ -283,9 +283,9 @@ class Member(Interface):
             self.joined.discretisation.set(far=far)
 
     @property
-    def asked(self) -> bool:
+    def in_reach(self) -> bool:
         """Whether any contactor of this contact, on any rank, was near the target in the last placement."""
-        return self.joined.asked and not self.far
+        return self.joined.in_reach and not self.far
 
     @property
     def kinematics(self) -> Kinematics:  # type: ignore[override]
@@ -298,7 +298,7 @@ class Member(Interface):
     def _kinematics_of(self, whole: Any) -> Kinematics:
         some, points = self._rows, whole.points[self._rows]
         of: Any = self.discretisation
-        if not self.asked:
+        if not self.in_reach:
             return of.nowhere(points)
         nearest = self._alone(whole.nearest)
         projection = nearest if whole.projection is whole.nearest else self._alone(whole.projection)

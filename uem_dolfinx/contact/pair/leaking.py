@@ -94,7 +94,7 @@ class LeakingInterface(Interface):
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """The fluid's forces by the rows of gaps, as loads of both bodies (collective)."""
-        if not self.asked:
+        if not self.in_reach:
             return None
         # a contact that was switched off has no fluid
         wet = self._inlet if self.trial.wet is None else self.trial.wet
@@ -113,7 +113,7 @@ class LeakingInterface(Interface):
             # the next step has rows of its own
             self._begun = None
         none: Array = np.zeros((self.config.n_owned, self.config.gdim))
-        return none if self._acting is None or not self.asked else self.config.add_at_owners(*self._acting)
+        return none if self._acting is None or not self.in_reach else self.config.add_at_owners(*self._acting)
 
     def commit(self) -> None:
         """See ``Interface``."""

@@ -15,7 +15,7 @@ With damping c the pressure at the end of a time step dt that begins at the gap 
     P(g) = max(p(g) + c (min(h, r) - min(g, r)) / dt, 0)
 
 with the gap at rest r: the mean speed while the surfaces are in contact. P is a monotone and continuous law of the gap, so that damped
-contact is solved in the same way; it vanishes from the gap s <= r on, at which surfaces that separate come off.
+contact is solved in the same way. It vanishes from the gap s <= r on, at which surfaces that separate come off.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class SoftInterface(Interface):
     @property
     def _acts(self) -> bool:
         """Whether any contactor may press."""
-        return self.asked and self.trial.law_gap is not None
+        return self.in_reach and self.trial.law_gap is not None
 
     # -- placement and forces --------------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ TOUCHING = 1e-9
 #: Gaps below this part of the model's size are zero.
 #: [convention; the model's size; test_active_set.py::test_gaps_below_rounding_do_not_activate]
 GAP_ROUNDING = 1e-13
-#: Where more contactors enter than touch, only those deeper than this part of the deepest do, or deeper still in the plane: a
+#: Where more contactors enter than touch, only those deeper than this part of the deepest do, or deeper still in the plane. A
 #: paraboloid that comes down on something elastic touches where it would overlap by more than half of the most (Hertz).
 #: [derived; the deepest overlap; test_active_set.py::test_first_touch_of_a_paraboloid]
 DEEP_ENOUGH = 0.5
@@ -33,7 +33,7 @@ GIVING_WAY = 0.25
 #: [convention; width of the overlap; test_active_set.py::test_first_touch_of_a_paraboloid]
 HALF_WIDTH = 1 / 3
 #: So many exchanges in a row may bring no fewer wrong contactors, and no state again, before the first is exchanged alone.
-#: [convention; exchanges; test_active_set.py::test_when_the_first_goes_alone]
+#: [convention; exchanges; test_active_set.py::test_when_only_the_first_is_released]
 PATIENCE = 30
 
 

@@ -37,7 +37,7 @@ class OnTarget:
         free: components without Dirichlet condition of the contactors ``(n, gdim)``.
         setting: what is set for the contactors.
         anchor: projection whose closest points are kept, with small or fixed sliding.
-        asked: whether any contactor on any rank was near the target in the last placement.
+        in_reach: whether any contactor on any rank was near the target in the last placement.
     """
 
     traits: Traits
@@ -53,7 +53,7 @@ class OnTarget:
         self.setting = Setting(free, False, far=none, on=~none, mutual=none, label=np.zeros(len(nodes), dtype=np.int64))
         self.set(free=free)
         self.anchor: Projection | None = None
-        self.asked = True
+        self.in_reach = True
         self._renewing = False  # whether small sliding renews its closest points in the next step
         #: Last projection: positions of contactors and target, the anchor, and the result.
         self._projected: tuple[Array, Array, Projection | None, Projection] | None = None

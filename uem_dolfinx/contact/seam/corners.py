@@ -75,8 +75,8 @@ class Corners:
             mu: coefficients of friction, for all or for each ``(k,)``.
 
         Returns:
-            Coefficients ``(k, gdim)`` with which the facets' unit normals sum up to the force, or, where they span less than the
-            space, to the part of it in their span; of those possible the least in norm. A facet whose coefficient is negative pulls.
+            Coefficients ``(k, gdim)`` with which the facets' unit normals sum up to the force, or to its part in their span, if
+            they span less than the space. Of all such coefficients they are the least in norm. A facet whose coefficient is negative pulls.
             They are infinite beyond ``count``, where there is no facet.
         """
         mean = self.axes[:, 0]

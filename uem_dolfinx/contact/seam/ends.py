@@ -28,8 +28,8 @@ class Ends:
     a contactor                               is remembered as      and is out
     ========================================  ====================  =========================================================
     slides to an end                                                past the end to rounding (``ON_SIDE``)
-    came to the end, or was drawn there       ``at_end``            past it by ``END_HOLDS`` of a facet: a blow is spared
-    was drawn, or came in front, past it,     ``at_end``            the same: no other contactor is there
+    came to the end, or was pulled there      ``at_end``            past it by ``END_HOLDS`` of a facet: no impact is added
+    was pulled, or came in front, past it,    ``at_end``            the same: no other contactor is there
     with a facet over the target
     has slid off in this step                 ``at_end, passed``    past the end to rounding; under mortar until
                                                                     ``COVERED_AGAIN`` of its share is covered

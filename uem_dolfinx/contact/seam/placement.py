@@ -352,7 +352,7 @@ class Discretisation(Protocol):
         """Properties that no placement changes."""
 
     #: Whether any contactor on any rank was near the target in the last placement; otherwise no other function is called.
-    asked: bool
+    in_reach: bool
 
     def set(self, **changed: Any) -> None:
         """Set parts of the setting but ``prescribed``; contactors must be placed again (collective)."""

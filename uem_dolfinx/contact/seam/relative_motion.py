@@ -12,7 +12,7 @@ from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
 from uem_dolfinx.geometry.configuration import Configuration
 
 #: Where more than this part of what a prescribed contactor follows in a mean is prescribed as well, as on a plane of symmetry, this part
-#: counts alone: integrals over one side of the plane have parts of the nodes beside it. Halves are on the safe side of rounding.
+#: counts alone: integrals over one side of the plane have parts of the nodes next to it. Halves are on the safe side of rounding.
 #: [convention; part of the weights; test_ties.py::test_what_is_held_tells]
 MOST_HELD = 0.5 + 1e-6
 

@@ -56,7 +56,7 @@ class Pair(Protocol):
     friction: Sliding | None
 
     @property
-    def asked(self) -> bool:
+    def in_reach(self) -> bool:
         """Whether any contactor on any rank was near the target in the last placement."""
 
     @property
@@ -302,7 +302,7 @@ class Heat:
 
         Collective.
         """
-        if not self.pair.asked:
+        if not self.pair.in_reach:
             none = np.zeros(self.pair.config.n_owned)
             return none, none
         at = self.passage

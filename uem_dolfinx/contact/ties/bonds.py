@@ -1,7 +1,7 @@
 """Bonds of contactors to the points of the target that faced them at the start: ties that open, by the law of an interface.
 
 Their openings are what the equations of ``tied_rows`` leave, in both couplings. No component is eliminated: the bonds have forces and
-stiffnesses, and contact acts beside them.
+stiffnesses, and contact acts in addition.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ PULLS = 1e-8
 #: [convention; facets; test_warnings.py::test_surfaces_that_conform]
 CONFORMING = 4
 #: One equation of mortar at a node is sufficient if the sum of the areas of its facets, over the length of the sum of their area vectors,
-#: is smaller; the facets of a tip of 39 degrees have this ratio. [convention; areas; test_warnings.py::test_slim_tips]
+#: is smaller. The facets of a tip of 39 degrees have this ratio. [convention; areas; test_warnings.py::test_slim_tips]
 SLIM = 3.0
 #: A warning is given if more than this part of the surface in contact has slid off the end of the target.
 #: [convention; area; test_warnings.py::test_contactors_that_slip_off]

@@ -89,9 +89,9 @@ def _side(config: Configuration, tag: Tag) -> float:
 
 
 def warn_past_seams(contacts: Sequence[Any]) -> None:
-    """Warn of contactors that start past the end of a target that goes on at its seam, on the other side of the body (collective).
+    """Warn of contactors that start past the end of a target that continues at its seam, on the other side of the body (collective).
 
-    There are no images of a target: contact is missing there, and what is beside it bears that force.
+    There are no images of a target: contact is missing there, and contactors next to it bear that force.
     """
     for contact in contacts:
         pair, config, seams = contact.pair, contact.config, seams_of(contact.config)

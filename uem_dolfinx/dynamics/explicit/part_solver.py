@@ -204,7 +204,7 @@ def numbers(space: Nodes, own: Ints) -> PETSc.IS:
     return PETSc.IS().createGeneral((own + space.block * space.first).astype(PETSc.IntType), comm=space.comm)
 
 
-#: Solves with the kept matrix in one step, before Newton's method goes on with its own.
+#: Solves with the kept matrix in one step, before Newton's method continues with a new one.
 #: [convention; solves; test_explicit.py::test_how_long_a_factor_of_the_surface_serves]
 MOST_SURFACE_SOLVES = 4
 #: The kept matrix serves as long as Newton's method needs no more iterations after it.
@@ -239,7 +239,7 @@ class Prediction:
         """Move nodes with mass to ``start (n,)``, ghosts included, and the surface from there into equilibrium with the last contact."""
         problem, bodies, system = self.problem, self.problem.bodies, self.system
         if system.rows is None:
-            # the first step of a run that goes on
+            # the first step of a continued run
             bodies.update_tangent()
         system.rows_of_last()
         if not self.kept:

@@ -61,7 +61,7 @@ def highest_eigenvalue(apply: Callable[[Array], Array], mass: Array, start: Arra
 #: A surface at rest makes the square of the highest frequency much larger if by more than this factor: contacts then change the step.
 #: [convention; square of the highest frequency; test_explicit.py::test_stiff_contactors_do_not_shorten_steps]
 STIFF_SURFACE = 1.25
-#: Contacts that change the critical step bounce on a surface that is stiffer than the bodies: from their first touch on, steps are at
+#: Contacts that change the critical step bounce on a surface that is stiffer than the bodies. From their first touch on, steps are at
 #: most this part of the critical one with closed contacts, so that they resolve the bounce.
 #: [convention; critical step; test_explicit.py::test_a_thin_layer_at_the_wall]
 RESOLVED = 0.25

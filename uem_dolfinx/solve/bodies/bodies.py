@@ -42,7 +42,7 @@ ABOVE_ROUNDING = 100.0
 #: [derived; the largest prescribed value; test_bodies.py::test_dirichlet_values_are_met]
 VALUE_ROUNDING = 4.0 * np.finfo(float).eps
 #: Past the point where the residual does no more work, a step of bodies that yield may leave this part of it [Matthies and Strang,
-#: International Journal for Numerical Methods in Engineering 14 (1979) 1613-1626]: where it is longer, they yield far too much.
+#: International Journal for Numerical Methods in Engineering 14 (1979) 1613-1626]. Where it is longer, they yield far too much.
 #: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
 MOST_PAST = 0.5
 

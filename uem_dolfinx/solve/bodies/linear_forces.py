@@ -48,7 +48,7 @@ class LinearForces:
         """Write F(u) to the owned entries of ``b``; loads that have changed since the last call take an assembly (collective)."""
         bodies, (values, same) = self._bodies, forms.read_values(self._inputs, self._values)
         bodies.tangent.update()
-        # a run that goes on from a checkpoint begins with a product, like the step there of the uninterrupted one
+        # a run that continues from a checkpoint begins with a product, like the step there of the uninterrupted one
         same |= self._values is None
         self._values = values if self._values is None else self._values
         if not reduced(bodies.comm, same, op=MPI.LAND) or bodies.tangent.completed:

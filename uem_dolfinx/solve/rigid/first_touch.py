@@ -83,25 +83,25 @@ def deepest_of(pairs: Sequence[Interface], gaps: Sequence[Array], violated: Sequ
     return [w.on_first_touch(gap, depth) for w, gap in zip(violated, gaps)]
 
 
-def nodes_beside(config: Configuration, pairs: Sequence[Interface]) -> Callable[[Bools], Bools] | None:
+def nodes_next_to(config: Configuration, pairs: Sequence[Interface]) -> Callable[[Bools], Bools] | None:
     """Function from a mask of nodes to the mask of owned nodes of target facets at these nodes ``(n_owned,)``; None without sliding."""
     moving = [pair.target for pair in pairs if slides(pair) and pair.target.n_nodes and pair.tie is None]
     facets = list({id(target.dofs): target.dofs for target in moving}.values())
     every = np.arange(config.n_local)
 
-    def beside(nodes: Bools) -> Bools:
+    def next_to(nodes: Bools) -> Bools:
         on = config.from_owners(every[: config.n_owned], nodes[:, None].astype(float), every)[:, 0] > 0.0
         found = np.concatenate([dofs[on[dofs].any(axis=1)].ravel() for dofs in facets])
         return followed_nodes(config, found)[: config.n_owned]
 
-    return beside if facets else None
+    return next_to if facets else None
 
 
 def way_ahead(bodies: Bodies, solver: UnitedSolver, pairs: Sequence[Interface], first: bool) -> Array | None:
     """Way of the owned nodes by which contactors may come together ``(n_owned, gdim)``; None to solve the present state alone.
 
-    Problems with friction are solved on arrays from the beginning where a condensation is kept, in contact as it is or with the velocity of
-    the last step's end, and the ``first`` one of a time step where other states would be factorised anew.
+    Problems with friction are solved on arrays from the beginning where a condensation is kept, in the present contact or with the velocity
+    of the last step's end. So is the ``first`` one of a time step where other states would be factorised anew.
     """
     dynamics, way = bodies.dynamics, np.zeros((bodies.forces.size // bodies.config.gdim, bodies.config.gdim))
     ahead = first and dynamics is not None and not (solver.lasting or solver.iterative)

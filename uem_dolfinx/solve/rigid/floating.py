@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from uem_dolfinx.conditions.user_rows import UserRows
     from uem_dolfinx.solve.bodies.far_apart import FarApart
 
-#: Bodies that slide without end are taken so many sizes of the model, to ask which contactors that would turn back.
+#: Bodies that slide without end are moved by so many sizes of the model, to find the contactors whose slip this would reverse.
 #: [convention; the model's size; test_friction.py::test_what_slides_away]
 FAR = 1e3
 #: Bodies turn by so much in a step, in radians, and go as far as their radius times that, or to where they touch first.

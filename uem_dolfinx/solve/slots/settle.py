@@ -206,8 +206,8 @@ def settle(
 def _near(equations: UnitingEquations, space: Nodes, du: Array) -> Bools:
     """Rows whose gaps are not wider than their nodes and the nodes that these follow go in an increment ``(m,)`` (collective)."""
     eq, way = equations, np.linalg.norm(du, axis=1)
-    asked, term = np.unique(eq.followed, return_inverse=True)
-    there = space.ask_owners(asked, way[:, None])[term, 0] * np.linalg.norm(eq.coefficients, axis=1)
+    distinct, term = np.unique(eq.followed, return_inverse=True)
+    there = space.ask_owners(distinct, way[:, None])[term, 0] * np.linalg.norm(eq.coefficients, axis=1)
     reach = np.linalg.norm(eq.direction, axis=1) * way[eq.node] + np.bincount(eq.row, there, len(eq))
     return np.asarray(eq.gap <= reach)
 

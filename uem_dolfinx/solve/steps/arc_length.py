@@ -2,8 +2,8 @@
 
     Q'KP dq = Q'(r - K c) - dlam Q'F_lam,    a . (u + du - u0) + b (lam + dlam - lam0) = 1,    F_lam = dF/dlam
 
-Riks' method is ``a = t / s``, ``b = 0`` with t the direction of the last step and s its length: a constraint plane, solved with a single
-constrained matrix and two right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are
+Riks' method is ``a = t / s``, ``b = 0`` with t the direction of the last step and s its length. This constraint plane is solved with a
+single constrained matrix and two right-hand sides [Riks, International Journal of Solids and Structures 15 (1979) 529-551]. Lengths are
 measured in the displacement only: other fields, with other units, have no part in t. ``Dissipation`` adds a dissipated energy.
 """
 

@@ -117,7 +117,7 @@ class ByError(ByLoad):
         return [*first, *second[1:]]
 
     def _largest_turn(self, done: float, factor: float) -> float:
-        """How far the load of either half is from its straight way, or goes back on it, the root of a work (collective)."""
+        """Distance of the load of either half from its straight path, or along it backwards, the root of a work (collective)."""
         problem = self._problem
         stiffness = problem.bodies.stiffness
         if stiffness is None:

@@ -31,7 +31,7 @@ def load_steps(
     estimate: Callable[[UnitedProblem], None] | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Iterator[LoadStep]:
-    """Apply the load in steps, cut on failure and increased again after easy steps, up to the nominal length, with a progress bar.
+    """Apply the load in steps, cut on failure and increased again after steps that converge quickly, up to the nominal length.
 
     Args:
         problem: problem to solve; its ``load`` is evaluated at factors from 0 to 1 and its Dirichlet values are ramped.
@@ -52,8 +52,8 @@ def load_steps(
 
     Raises:
         InputError, InputTypeError: if ``steps`` is neither a positive whole number nor a list of ``Step``, or if a step is not of this
-            problem; with ``arc_length`` if no load moves the bodies, if Dirichlet values do, for a list of ``Step``, or with
-            ``tolerance``; with ``tolerance`` while the problem is recorded.
+            problem. With ``arc_length`` if no load moves the bodies, if Dirichlet values do, for a list of ``Step``, or with ``tolerance``.
+            With ``tolerance`` while the problem is recorded.
         CheckpointError: see ``Checkpoint``.
         ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: if a step fails even at 1/1024 of its
             nominal length; the last converged state is kept.

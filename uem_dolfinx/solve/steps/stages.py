@@ -51,7 +51,7 @@ class Step:
         n: nominal number of load steps, cut on failure as in ``load_steps``.
         bcs: all Dirichlet conditions of the step; None keeps the conditions of the previous step.
         loads: as ``load`` of a ``UnitedProblem``: ``{constant: value}``, each with its value at the end of the step, to which it is
-            ramped from the present one, or a function of s; or one function of s that sets loads and Dirichlet values itself, which
+            ramped from the present one, or a function of s. Or one function of s that sets loads and Dirichlet values itself, which
             are then not ramped.
         contacts: contacts that are switched on (True) or off (False). A contact that is switched on starts as in a new problem, at
             the present positions of the bodies.

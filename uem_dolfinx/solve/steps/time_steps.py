@@ -72,7 +72,7 @@ def time_steps(
 
     Raises:
         InputError, InputTypeError: if ``dt`` is not positive, too long for an explicit scheme, or smaller than the
-            rounding error of the time; if ``end`` is before the start or not finite, or ``event_tolerance`` not between 0 and 1.
+            rounding error of the time. If ``end`` is before the start or not finite, or ``event_tolerance`` not between 0 and 1.
         SpaceError: if the problem has no dynamics.
         CheckpointError: see ``Checkpoint``.
         TunnellingError: if a contactor passes through a target even in the shortest step.

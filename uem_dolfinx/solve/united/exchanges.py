@@ -44,8 +44,8 @@ AS_LONG_IF_CHEAP = 10
 #: A state that comes again with more than this part of the residual that it had has led nowhere.
 #: [convention; norm of the residual; test_exchanges.py::test_states_that_come_again]
 NO_LESS = 0.9
-#: Curvature of contact that could make the tangent indefinite is left out until so much of the residual is left; releases with which
-#: bodies jump are put off as often as the residual has fallen to this part.
+#: Curvature of contact that could make the tangent indefinite is left out until so much of the residual is left. Releases that let
+#: bodies jump are delayed as often as the residual has fallen to this part.
 #: [convention; norm of the residual; test_exchanges.py::test_convex_until_it_gets_better]
 WHOLE_AGAIN = 0.1
 #: States of a step may come again so often. [convention; rounds; test_exchanges.py::test_states_that_come_again]
@@ -54,7 +54,7 @@ MOST_ROUNDS = 6
 #: [convention; iterations; test_exchanges.py::test_convex_until_it_gets_better]
 OFTEN = 3
 #: So many of the contactors that change sides for ever are named.
-#: [convention; contactors; test_exchanges.py::test_who_goes_in_a_circle_is_named]
+#: [convention; contactors; test_exchanges.py::test_contactors_in_a_cycle_are_named]
 NAMED = 3
 
 

@@ -29,10 +29,10 @@ LONGEST_SEARCH = 64.0
 #: [convention; work or norm of the residual; test_newton_loop.py::test_what_the_line_search_accepts]
 ENOUGH_DECREASE = 0.9
 #: A solve that another iteration follows leaves this part of its right-hand side, times the relative residual [Eisenstat and Walker,
-#: SIAM Journal on Scientific Computing 17 (1996) 16-32]; one that asks which contactors are wrong leaves this part as it is.
+#: SIAM Journal on Scientific Computing 17 (1996) 16-32]. A solve that only finds contactors in a wrong state leaves this part as it is.
 #: [heuristic; right-hand side; test_newton.py::test_a_solve_that_another_follows_is_coarse]
 FORCING = 1e-4
-#: One that may be the last leaves this part of what convergence asks for, and of its right-hand side at most.
+#: A solve that may be the last leaves this part of the residual that convergence requires, and of its right-hand side at most.
 #: [convention; norm of the residual; test_newton.py::test_the_last_solve_is_as_accurate_as_convergence_asks]
 ACCURACY_AT_THE_END = 0.1
 

@@ -41,7 +41,7 @@ class OverConstraints:
     Args:
         pairs: of all contacts; ``mutual`` of their settings is set if surfaces are contactor and target of each other.
         linear: equations of users, or None.
-        held: whether conditions hold contactors that the pairs do not know of.
+        held: whether conditions prescribe contactors of which the pairs have no data.
     """
 
     def __init__(self, config: Configuration, pairs: Sequence[Interface], linear: UserRows | None = None, held: bool = False):
@@ -302,7 +302,7 @@ def _restricted(
 
 
 def _meet(rigid: Sequence[Interface]) -> None:
-    """Let contacts with rigid surfaces know the normals of the others that hold the same contactors (collective)."""
+    """Set in contacts with rigid surfaces the normals of others that constrain the same contactors (collective)."""
     if not rigid:
         return
     node, held = (np.concatenate(parts) for parts in zip(*((pair.nodes, pair.trial.active) for pair in rigid)))
@@ -372,7 +372,7 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
             start = part.stop
         found[i] = found[i]._replace(heat=np.column_stack(powers))
     if rows.rigid is not None:
-        last = rows.rigid.beside(last, rows.whole.Q.select(np.arange(len(rows.whole)) < len(lam)), lam)
+        last = rows.rigid.with_rewritten(last, rows.whole.Q.select(np.arange(len(rows.whole)) < len(lam)), lam)
     known = dict(zip(map(id, rows.pairs), found))
     return [known.get(id(pair)) or pair.traction for pair in pairs], np.append(lam[start:], last)
 

@@ -24,7 +24,7 @@ from uem_dolfinx.parallel import gathered, reduced
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.bodies.field_scales import first, ratio
 from uem_dolfinx.solve.bodies.tangent import added_mass, curvature_of, known_forces, slip_terms, together
-from uem_dolfinx.solve.rigid.first_touch import nodes_beside, touch_ahead, way_ahead
+from uem_dolfinx.solve.rigid.first_touch import nodes_next_to, touch_ahead, way_ahead
 from uem_dolfinx.solve.rigid.floating import FloatingBodies
 from uem_dolfinx.solve.rigid.unheld import refuse_bare
 from uem_dolfinx.solve.united import rows as united_rows
@@ -98,7 +98,7 @@ class BodySystem:
         self._look()
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         self.over_constraints = OverConstraints(self.config, self.pairs, self.linear)
-        self.solver.condensed.beside = nodes_beside(self.config, self.pairs)
+        self.solver.condensed.adjacent_nodes = nodes_next_to(self.config, self.pairs)
         self.floating = FloatingBodies(self.bodies, self.pairs, linear, self.far_apart)
 
     def _look(self) -> None:
@@ -235,7 +235,7 @@ class BodySystem:
         return np.asarray(np.einsum("ng,ng->n", normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
     def rows_of_last(self) -> Rows:
-        """Equations of the last state; those at the last projection if a run begins or goes on, and of mortar (collective)."""
+        """Equations of the last state; those at the last projection if a run begins or continues, and of mortar (collective)."""
         if self.rows is None or not all(pair.discretisation.traits.two_pass for pair in self.near):
             self.rows = self.present_rows()
         return self.rows
@@ -286,9 +286,9 @@ class BodySystem:
             near = max(PREDICTED, left) * way
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
-            gaps = [pair.kinematics.gap_rows.gaps(increment) if pair.asked else pair.kinematics.gap for pair in self.pairs]
+            gaps = [pair.kinematics.gap_rows.gaps(increment) if pair.in_reach else pair.kinematics.gap for pair in self.pairs]
             violated = [Violations.none(len(pair.nodes)) for pair in self.pairs]
-            for k, pair in [(k, pair) for k, pair in enumerate(self.pairs) if pair.asked]:
+            for k, pair in [(k, pair) for k, pair in enumerate(self.pairs) if pair.in_reach]:
                 along = self._across(pair)
                 least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
                 violated[k] = pair.violated(gaps[k], forces[k], least, near, self._swept, moved)
@@ -308,7 +308,7 @@ class BodySystem:
                 self._take(forces)
                 return None
             self.curvature = None if self.exchanges.straight else self.curvature
-            for pair, w in ((pair, w) for pair, w in zip(self.pairs, chosen) if pair.asked):
+            for pair, w in ((pair, w) for pair, w in zip(self.pairs, chosen) if pair.in_reach):
                 pair.exchange(w)
             return self._with_rows(state)
 
@@ -347,7 +347,7 @@ class BodySystem:
 
     def _take(self, forces: list[Traction]) -> None:
         """Store the contact forces in the pairs."""
-        for pair, own in [(pair, own) for pair, own in zip(self.pairs, forces) if pair.asked]:
+        for pair, own in [(pair, own) for pair, own in zip(self.pairs, forces) if pair.in_reach]:
             pair.set_forces(own)
         if self.linear is not None:
             self.linear.multipliers = self._multipliers
