@@ -49,7 +49,7 @@ problem = uem.UnitedProblem(
 # %% [markdown]
 # ## The flight
 # A bounce is a touch after which the middle of the ring rises again. Eight frames go into the picture; with `--output` one every
-# 0.1 s goes into a film.
+# 0.1 s is written to a film.
 
 # %%
 frames, falls = [], [True]

@@ -61,7 +61,7 @@ problem = uem.UnitedProblem(
 
 # %% [markdown]
 # ## To rest
-# A step that fails, since it goes too far, is taken again with four times the drag; after others the drag falls to a third.
+# A step that fails, since it is too large, is taken again with four times the drag; after others the drag falls to a third.
 
 # %%
 rows = []

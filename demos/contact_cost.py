@@ -11,7 +11,7 @@ Options:
 #
 # Two measurements, each a ratio of things done in one run.
 #
-# 1. The Hertz scenes with about 100,000 unknowns in 2D and in 3D: how much of the time of the Newton iterations goes into search and
+# 1. The Hertz scenes with about 100,000 unknowns in 2D and in 3D: how much of the time of the Newton iterations is spent on search and
 #    projection, the uniting equations with the curvature of the contact, P and the product P'KP.
 # 2. A block upon a block, once as two bodies in contact and once meshed as one body, fused over the contact area: how many iterations
 #    CG takes with the same preconditioner and tolerance.
@@ -57,7 +57,7 @@ def clock(stage: str) -> float:
 
 
 def share(dim: int) -> dict[str, object]:
-    """Solve a Hertz scene and see where the time goes, per cent of all Newton iterations."""
+    """Solve a Hertz scene and measure the shares of time, per cent of all Newton iterations."""
     if dim == 2:
         names, parameters = ("hertz_cylinder", "disc_arc", "disc_top"), {"h": (1 / 120) * (11_000 / args.dofs) ** 0.5}
         push, fixed = -0.006, ["symmetry"]

@@ -29,8 +29,8 @@ Options:
 # | row_blocks, most_row_blocks | blocks of a row of P at an eliminated node, mean and largest |
 # | python_bytes | memory of Python and NumPy, the largest from the making of the problem on |
 #
-# The model has a term for each part of the scene that a rank may have to do with; what goes with the number of ranks, or with the whole
-# surface, does not scale.
+# The model has a term for each part of the scene that a rank may have to do with; terms that grow with the number of ranks, or with the
+# whole surface, do not scale.
 
 # %%
 import common
@@ -72,8 +72,8 @@ else:
 
 # %% [markdown]
 # ## The model, and what it says on paper
-# A thousand ranks of so many unknowns, and other numbers of ranks with as many each: `own` is what goes with a rank's own part and stays,
-# `grows` what goes with the number of ranks or with the whole surface.
+# A thousand ranks of so many unknowns, and other numbers of ranks with as many each: `own` are terms of a rank's own part, which stay,
+# `grows` terms that grow with the number of ranks or with the whole surface.
 
 # %%
 models, paper = [], []

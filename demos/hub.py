@@ -20,7 +20,7 @@ Options:
 #    u = A r + B / r of both rings the pressure p follows from u_hub - u_shaft = delta at the seat.
 # 2. The torque: the shaft's hole is turned. Friction carries T = mu p (2 pi b) b at most, per unit of thickness; from there on the
 #    seat slips.
-# 3. The release: the contact is switched off. What it carried, pressure and torque, goes to zero in proportion, and nothing is left.
+# 3. The release: the contact is switched off. Its pressure and torque decrease to zero in proportion, and nothing is left.
 
 # %%
 import common

@@ -14,8 +14,8 @@ Options:
 # %% [markdown]
 # # What is the coating made of?
 #
-# A stiff disc is pressed into a block with a coating. The deeper it goes, the wider it touches, and the less the coating alone decides on
-# the force: both moduli follow from forces F_k at some depths, by least squares of F_k(E) / F_k - 1.
+# A stiff disc is pressed into a block with a coating. The deeper the indentation, the wider the contact, and the less the coating alone
+# determines the force: both moduli follow from forces F_k at some depths, by least squares of F_k(E) / F_k - 1.
 #
 # One adjoint problem with the united matrix gives the derivatives of a force by both moduli (`uem.gradient`), exactly those of the discrete
 # contact problem. The force is a functional of the displacement: the work of the residual on a unit motion of the disc's top. "Measured"

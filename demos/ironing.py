@@ -157,7 +157,7 @@ results = {
     "force": float(mean[-1]),
     "mean_drag_ratio": float(abs(mean[0] / mean[-1])),
     # each contactor's friction along the surface over its force normal to it; the drag is another ratio:
-    # the slab's surface is shorter under the tool, so that less is slid, and less work done, than the tool goes
+    # the slab's surface is shorter under the tool, so that slip and frictional work are less than by the motion of the tool
     "local_drag_ratio": float(np.divide(*np.array(local)[inside].sum(axis=0))),
     "largest_drag_ratio": float(np.abs(force[inside][:, 0] / force[inside][:, -1]).max()),
     "return_error": float(np.abs(force[inside][-1] - force[inside][0]).max() / mean[-1]),

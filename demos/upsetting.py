@@ -117,7 +117,7 @@ if writer is not None:
 
 # %% [markdown]
 # ## The table
-# The change of volume shows whether the cells lock; the work of the tool goes into plastic flow and friction.
+# The change of volume shows whether the cells lock; the work of the tool is dissipated by plastic flow and friction.
 
 # %%
 F = uem.displacement_gradient(u)

@@ -123,7 +123,7 @@ def _off_line(normals: Array, force: Array, largest: float) -> float:
     """What a force has across the mean of some normals ``(k, gdim)``, but for what these differ by from each other.
 
     Pressures between the nodes of mortar may be negative, so that forces between facets that lean need not lie in their cone, and
-    those of two facets may cancel but for their lean: this goes by the ``largest`` force on the facets.
+    those of two facets may cancel but for their lean: the scale is the ``largest`` force on the facets.
     """
     mean = _mean(normals)
     spread = np.linalg.norm(normals - np.outer(normals @ mean, mean), axis=1).max()

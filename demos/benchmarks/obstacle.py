@@ -140,7 +140,7 @@ def by_springs(m: Membrane, stiffness: float) -> Found:
 
 
 def by_barrier(m: Membrane, first: float) -> Found:
-    """The potential -mu A log(gap), from a first mu on; no step goes farther than 0.9 of the way to the obstacle."""
+    """The potential -mu A log(gap), from a first mu on; no step exceeds 0.9 of the distance to the obstacle."""
     w, mu, k = np.full(len(m.psi), 2 * m.psi.max()), first, 0
     while True:
         while k < MOST:

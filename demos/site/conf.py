@@ -1,6 +1,6 @@
 """Settings of the documentation: Sphinx with MyST; the demos are read as the notebooks that they are, see ``reading``.
 
-.ci/site builds it. Pages lie here, in the demos and in the package; what is generated goes to the folder that is named.
+.ci/site builds it. Pages lie here, in the demos and in the package; generated files are written to the given folder.
 """
 
 import sys

@@ -126,7 +126,7 @@ def cone() -> dict[str, float]:
     contact = pressed(domain, [tags["x0"], tags["y0"]], tags["y1"], tip, uem.LinearElastic(E, NU, kind="axisymmetric"))
     x, _, forces = gathered(contact)
     force = abs(float(contact.resultant().force[1])) / (2 * STIFF * depth**2 / (np.pi * slope))
-    # pressures arcosh(a / r) have the mean radius pi a / 6, and a goes with the root of the force
+    # pressures arcosh(a / r) have the mean radius pi a / 6, and a is proportional to the root of the force
     return {"force": force, "mean_radius": float((forces @ x[:, 0]) / forces.sum() / (np.pi / 6 * np.sqrt(force)))}
 
 

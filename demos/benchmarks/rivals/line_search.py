@@ -1,4 +1,4 @@
-"""A line search for contact forces that come from a potential: go on until the step no longer goes down."""
+"""A line search for contact forces that come from a potential: continue until the energy no longer decreases."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class ProximalSystem(PenaltySystem):
         far = work > COMPLEMENTARY * size or differ > AT_END
         if far and differ <= INNER and R.norm() <= max(INNER * F.norm(), rounding):
             self._psi_before, self._psi = [np.array(psi) for psi in self._psi], list(self._psi)
-            # the force goes on as it is
+            # the force stays as it is
             self._length *= GROWTH
             for k, s in enumerate(self._springs):
                 area = np.where(s.area != 0.0, s.area, 1.0)
