@@ -37,7 +37,7 @@ import thresholds
 from thresholds import Threshold
 
 TESTS = thresholds.REPOSITORY / "tests"
-#: Seconds that a run may take; a test that goes on for ever has noticed nothing.
+#: Seconds that a run may take; a test that continues for ever has noticed nothing.
 LONGEST = 240
 #: Thresholds that no test notices yet: a list that may only become shorter.
 UNNOTICED = {"FAR", "KEPT"}

@@ -191,7 +191,7 @@ def test_condition_number():
 @pytest.mark.skipif(COMM.size > 1 or not methods.available("barrier"), reason="ipctk, on one rank")
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_barrier_never_touches(cell):
-    """Nothing overlaps; the error goes with dhat."""
+    """Nothing overlaps; the error is proportional to dhat."""
     united, contact, _ = pressed("united", cell=cell)
     run(united)
     errors = []

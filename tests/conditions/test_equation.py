@@ -135,7 +135,7 @@ def test_values_between_steps():
 
 
 def test_continues_from_a_checkpoint(folder):
-    """Load steps that go on from a file end where those of one run do, to the last bit; without the equations they are refused."""
+    """Load steps that continue from a file end where those of one run do, to the last bit; without the equations they are refused."""
     ends = []
     for stop in (3, 1, 3):
         c = Cell()

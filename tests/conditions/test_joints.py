@@ -132,7 +132,7 @@ def test_a_tilted_axis():
 
 
 def test_a_moving_axis():
-    """The axis goes with the first part: led round by a quarter turn, the second part turns about the axis there."""
+    """The axis moves with the first part: after a quarter turn of it the second part rotates about the axis there."""
     r = Row("hexahedron")
     quarter = 0.5 * np.pi
     base = r.part(0, motion=[0.0, 0.0, 0.0, lambda factor: quarter * factor, 0.0, 0.0])

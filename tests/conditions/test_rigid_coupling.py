@@ -174,7 +174,7 @@ def test_several_turns_are_counted():
     for step in uem.load_steps(problem, 4):
         assert coupling.rotation == pytest.approx(6.0 * np.pi * step.factor, rel=1e-13)
         if step.number == 2:
-            # a run that goes on from a checkpoint knows them
+            # a run that continues from a checkpoint knows them
             for act in (*state.collect, *state.restore):
                 act()
             assert coupling.turns == pytest.approx(3.0 * np.pi, rel=1e-13)

@@ -126,7 +126,7 @@ def test_all_others_come_to_an_end(entries, load, first, mu):
 
 
 def test_murty_s_circle():
-    """Exchanging all goes in circles in this problem of three (Murty, 1974); the first alone does not."""
+    """Exchanging all cycles in this problem of three (Murty, 1974); the first alone does not."""
     M, q = np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 2.0], [2.0, 0.0, 1.0]]), -np.ones(3)
     lam, rules, number = settle(M, q, np.array([True, False, False]))
     assert np.allclose(lam, 1 / 3) and number < 20

@@ -33,7 +33,7 @@ def pressed(law, p, n, cell="quadrilateral", degree=1, *, hold=True, **how):
     ("coupling", "n"), [("node_to_surface", (4, 4)), slow("mortar", (4, 4)), ("mortar", (5, 3)), slow("mortar", (3, 7))]
 )
 def test_patch(coupling, n, cell, degree):
-    """A uniaxial pressure goes through, also at the axis, where a node's area is that of the disc around it; no node has to be held."""
+    """A uniaxial pressure is transmitted, also at the axis, where a node's area is that of the disc around it; no node has to be held."""
     p = 3.0
     for hold in (True, False):
         s, contact, problem = pressed(
@@ -68,7 +68,7 @@ def test_pressures_to_integrate(degree, coupling, cell):
 
 @pytest.mark.parametrize(("coupling", "n"), [("node_to_surface", (4, 4)), ("mortar", (5, 3))])
 def test_tied_cylinders_are_pulled(coupling, n):
-    """A uniaxial tension goes through the tie."""
+    """A uniaxial tension is transmitted by the tie."""
     p = -3.0
     s, contact, problem = pressed(uem.LinearElastic(E, NU, kind="axisymmetric"), p, n, coupling=coupling, tied=True)
     problem.solve()
@@ -266,7 +266,7 @@ def test_a_plane_problem_beside():
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
 def test_checkpoints(coupling, folder):
-    """A run with plasticity and friction that was left goes on from its file as it would have; not as one with another law."""
+    """A run with plasticity and friction that was left continues from its file as it would have; not as one with another law."""
 
     def make(strength=5.0):
         s, contact = punch_and_base(0.1, coupling=coupling)

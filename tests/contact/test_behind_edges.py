@@ -1,4 +1,4 @@
-"""Contactors inside a target behind its concave edges: their gaps are heights over facets that go on, and turn with the bodies.
+"""Contactors inside a target behind its concave edges: their gaps are heights over facets that continue, and turn with the bodies.
 
 The test to read first is ``test_a_plug_that_almost_nothing_holds``.
 """

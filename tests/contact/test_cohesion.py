@@ -244,7 +244,7 @@ def test_a_fibre_is_pulled_out(coupling):
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("unloading", ["origin", "plastic"])
 def test_a_run_that_continues(folder, unloading, friction):
-    """From a checkpoint a run goes on as if it had not ended, with its damage; another law is named."""
+    """From a checkpoint a run continues as if it had not ended, with its damage; another law is named."""
     law = uem.Cohesive(1.0, 0.01, unloading=unloading)
 
     def begun(law=law):

@@ -132,7 +132,7 @@ def test_a_tip_in_a_pit_of_three_facets(stretch):
     ],
 )
 def test_a_block_pressed_into_a_corner(cell, degree, gap, aslant):
-    """By a tenth of its size in one step, between nodes of the corner: its own corner ends in the other's, and goes in no circle."""
+    """By a tenth of its size in one step, between nodes of the corner: its own corner ends in the other's, without a cycle."""
     low = notched(cell, [-0.5] * 2, [1.5] * 2, [16] * 2, 2)
     s = scene(COMM, cell, [low, box(cell, [gap] * 2, [1 + gap] * 2, [5] * 2)])
     V = compat.function_space(s.mesh, degree, (2,))

@@ -218,7 +218,7 @@ def test_impact(friction):
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.2, slow(0.0)])
 def test_checkpoints(friction, folder):
-    """A run that goes on from a checkpoint ends like one that was left alone, with rods that touch at several crossings."""
+    """A run that continues from a checkpoint ends like one that was left alone, with rods that touch at several crossings."""
 
     def begun():
         how = {"length": 12.0, "angle": 1.0, "along": (0.7, 1.3), "law": st_venant, "friction": friction, "way": (0.4, 0.2, -0.5)}

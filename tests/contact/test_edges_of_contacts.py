@@ -154,7 +154,7 @@ def test_thickness():
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.2, 0.0])
 def test_checkpoints(friction, folder):
-    """A run that goes on from a checkpoint ends like one that was left alone."""
+    """A run that continues from a checkpoint ends like one that was left alone."""
 
     def begun():
         return rods((11, 12), on_edge=False, friction=friction, surfaces=OUTSIDE, edges=True, corners=True, **OBLIQUE)

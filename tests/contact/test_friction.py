@@ -307,7 +307,7 @@ def test_the_sign_of_the_determinant():
 @pytest.mark.parametrize("cell", ["triangle", slow("hexahedron")])
 @pytest.mark.parametrize("rigid", [True, False])
 def test_going_on_from_a_checkpoint(cell, rigid, folder):
-    """Written by one rank in the middle of a slide and read by all, a run goes on as if it had not stopped."""
+    """Written by one rank in the middle of a slide and read by all, a run continues as if it had not stopped."""
     comm, side = MPI.COMM_WORLD, [0.01] if cell == "hexahedron" else []
     places = [(x, *side, -0.02) for x in (0.0, 0.01, 0.03, 0.08, 0.07, 0.02)]
     whole = driven(cell, 0.3, rigid=rigid)

@@ -164,7 +164,7 @@ def test_which_functions_follow_the_load():
 
 
 def test_friction_that_follows_the_load_continues_from_a_checkpoint(folder):
-    """Where it begins with zero, too: what slips goes on slipping."""
+    """Where it begins with zero, too: what slips continues slipping."""
 
     def friction(x, t):
         return 0.2 * max(t - 0.25, 0.0)

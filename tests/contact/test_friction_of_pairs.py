@@ -77,7 +77,7 @@ def half_of_top(side):
 
 @pytest.mark.slow
 def test_over_a_joint(folder):
-    """Every node has the friction of what it is on, while both parts carry the block as well; a run gone on with is the same."""
+    """Every node has the friction of what it is on, while both parts carry the block as well; a run continued is the same."""
     found, u = dragged()
     sides = set()
     for nodes in found:

@@ -204,7 +204,7 @@ def test_written_as_one(folder):
 
 
 def test_pairs_in_a_table(folder):
-    """Every step has a row for each pair that touches then, whose moment is about the origin; a run that goes on keeps those before."""
+    """Every step has a row for each pair that touches then, whose moment is about the origin; a run that continues keeps those before."""
     _, (contact,), problem = pressed(lambda b: [uem.GeneralContact(bodies={"base, below": cells_of(b, 0)})])
     pairs = contact.forces_of_pairs()
     assert [(t.first, t.second) for t, _ in pairs] == [("base, below", "body 2")]
@@ -246,7 +246,7 @@ def test_before_a_problem():
 
 @pytest.mark.parametrize("degree", [1, slow(2)])
 def test_going_on_from_a_checkpoint(degree, folder):
-    """A run that is left while discs touch, and gone on with, is the run that was not left."""
+    """A run that is left while discs touch, and continued, is the run that was not left."""
     discs, found = Discs(2, 1, degree=degree), []
     end = 0.16
     for name, stops in (("whole", [end]), ("parts", [0.14, end])):

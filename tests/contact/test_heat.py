@@ -111,7 +111,7 @@ def test_conductance_that_grows_with_the_pressure():
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_conductances_are_functions_of_no_negative_pressure(coupling):
-    """Contactors pull before they are let go of, and the law is given no negative pressure; what enters a body goes through the contact."""
+    """Contactors pull before their release, and the law gets no negative pressure; the heat that enters a body passes the contact."""
     least = []
 
     def h(p, g):

@@ -272,7 +272,7 @@ def test_derivatives_of_a_pressure(monkeypatch):
 
 @pytest.mark.parametrize("mu", [0.0, 0.3])
 def test_a_run_continues(mu, folder, monkeypatch):
-    """A run that goes on from the checkpoint of contacts that were treated alone is that of one in one go."""
+    """A run that continues from the checkpoint of contacts that were treated alone is that of one in one go."""
     with monkeypatch.context() as change:
         one_by_one(change)
         _, problem = stacks(3, mu=mu)
@@ -386,7 +386,7 @@ def between_walls(mu, moves=True):
 
 @pytest.mark.parametrize("mu", [0.0, 0.3])
 def test_rigid_surfaces_that_move(mu, folder, monkeypatch):
-    """A corner of two walls and a ball, each of which moves: steps, and a run that goes on."""
+    """A corner of two walls and a ball, each of which moves: steps, and a run that continues."""
     found = []
     for together in (True, False):
         if not together:

@@ -173,7 +173,7 @@ def test_an_end_holds_what_was_drawn_there(way, held, degree):
 
 @pytest.mark.parametrize("normals", ["facet", pytest.param("averaged", marks=pytest.mark.slow)])
 def test_round_a_corner(normals):
-    """The target goes on down the slab's end: led round the corner, the contactors press on the other side."""
+    """The target continues down the slab's end: led round the corner, the contactors press on the other side."""
 
     def way(factor):
         # out past the corner, down, then back against the slab's end

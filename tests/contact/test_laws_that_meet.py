@@ -125,7 +125,7 @@ CASES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case)))
 def test_works_or_is_refused(case, folder):
-    """Forces balance in every step; results, a run that goes on, and one on a single rank have the same numbers."""
+    """Forces balance in every step; results, a run that continues, and one on a single rank have the same numbers."""
     wrong = fault(*case)
     if wrong is not None:
         refused(*wrong, lambda: Sheared(*case))

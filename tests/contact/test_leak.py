@@ -178,7 +178,7 @@ def test_switched_off_and_on():
 
 
 def test_restart(tmp_path):
-    """A run that goes on from a checkpoint is the uninterrupted one."""
+    """A run that continues from a checkpoint is the uninterrupted one."""
     path = COMM.bcast(str(tmp_path / "kept"))
     whole, first, second = (Joint(lambda s: 1.5 * s, target="block") for _ in range(3))
     list(uem.load_steps(whole.problem, 10))

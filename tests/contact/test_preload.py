@@ -164,7 +164,7 @@ def test_turned_at_finite_strain(cell, coupling):
 
 @pytest.mark.parametrize("locked", [False, True])
 def test_continues_from_a_checkpoint(tmp_path, locked):
-    """A run that goes on from a file is the run that was not interrupted, to the last bit, free or locked."""
+    """A run that continues from a file is the run that was not interrupted, to the last bit, free or locked."""
     path, kept, found = COMM.bcast(str(tmp_path / "state")), [], []
     for continues in (False, True):
         j = Joint("mortar", force=0.03)

@@ -15,7 +15,7 @@ MU, PRESSURE, WAY = 0.2, 100.0, 0.3
 
 
 def test_slip_along_conditions_continues():
-    """Slip along a prescribed component goes on, slip across it or without a direction does not, nor that of those that have moved."""
+    """Slip along a prescribed component continues, slip across it or without a direction does not, nor that of those that have moved."""
     free = np.zeros((6, 2, 3))
     free[:, 0, 0] = 1.0
     direction = np.array([[0.0, 1.0, 0.0], [0.4, 0.9, 0.0], [0.7, 0.7, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -362,7 +362,7 @@ def united(rows):
         ([], [], 0),
         ([tie(3, 7, X), tie(7, 3, Y)], [{3, 7}], 0),
         ([tie(3, 7, X), tie(3, 7, Y), tie(7, 2, X), tie(7, 2, Y), tie(0, 1, X), tie(0, 1, Y)], [{2, 3, 7}], 2),
-        # a group that goes on in other nodes
+        # a group that continues in other nodes
         (sum(([tie(a, b, X), tie(a, b, Y)] for a, b in ((2, 0), (3, 1), (1, 4), (4, 7), (0, 3))), []), [{0, 1, 2, 3, 4, 7}], 0),
         # a component alone, a rotation, the opposite, a multiple, a mean
         ([tie(3, 7, X)], [], 1),

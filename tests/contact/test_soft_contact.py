@@ -237,7 +237,7 @@ def test_units_of_length(unit):
 
 
 def test_a_run_that_continues(folder):
-    """From a checkpoint a run goes on as if it had not ended; another law is named."""
+    """From a checkpoint a run continues as if it had not ended; another law is named."""
 
     def begun(law=ROUGH):
         b = blocks(COMM, "quadrilateral", 2, 3)
@@ -258,7 +258,7 @@ def test_a_run_that_continues(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("general", [True, slow(False)])
 def test_damped_surfaces_that_are_far_apart_at_first(general, folder):
-    """The flight before does not change how a damped block meets another, and a run that stops on the way goes on as the whole one."""
+    """The flight before does not change how a damped block meets another, and a run that stops on the way continues as the whole one."""
 
     def fallen(gap, n, stop=None):
         b = blocks(COMM, "quadrilateral", 2, 3, gap=gap)

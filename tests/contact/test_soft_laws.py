@@ -38,7 +38,7 @@ def test_a_table():
 
 
 def test_an_exponential_law_far_out():
-    """No overflow deep inside, where it goes on linearly; rounding of p0 is nothing far outside."""
+    """No overflow deep inside, where it continues linearly; rounding of p0 is nothing far outside."""
     law, h = uem.Exponential(1e6, 2e-6), 2e-6
     p, slope = pressures(law, np.array([-1e3, -35.0, 35.0, 37.0]) * h)
     assert (

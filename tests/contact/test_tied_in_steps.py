@@ -136,7 +136,7 @@ def test_dynamics_of_one_piece(coupling):
 @pytest.mark.parametrize("coupling", COUPLINGS)
 @pytest.mark.parametrize("after", [False, True])
 def test_checkpoint(coupling, after, tmp_path):
-    """A run that goes on from a file goes on with what was tied, where it was tied."""
+    """A run that continues from a file continues with what was tied, where it was tied."""
     path = COMM.bcast(str(tmp_path / "tied"))
     pulls = ([0.0, -0.02], [0.02, 0.03], [-0.01, 0.05])
 

@@ -1,4 +1,4 @@
-"""Wear by Archard's law: depths and volumes of flat pins in closed form, conservation of volume, and what a run goes on from.
+"""Wear by Archard's law: depths and volumes of flat pins in closed form, conservation of volume, and what a run continues from.
 
 Read first: ``test_a_flat_pin_wears_evenly``.
 """
@@ -156,7 +156,7 @@ def test_a_step_taken_again_wears_once():
 
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
 def test_wear_continues_from_a_checkpoint(coupling, folder):
-    """A run that goes on from a file ends as the one that was left alone, to the last bit in serial."""
+    """A run that continues from a file ends as the one that was left alone, to the last bit in serial."""
     whole, first, last = (Pin(friction=0.1, press=None, coupling=coupling) for _ in range(3))
     whole.slide(4)
     for i in range(3):

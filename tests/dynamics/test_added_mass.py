@@ -97,7 +97,7 @@ def flying(cell, inertia, spin):
 def test_a_free_spin(folder):
     """In the plane the trapezoidal rule keeps momentum, energy and spin of a body that is nothing but what is added.
 
-    So it does in a run that goes on from a checkpoint, to the last bit, and where a step is taken twice.
+    So it does in a run that continues from a checkpoint, to the last bit, and where a step is taken twice.
     """
     problem, dynamics, body, shift = flying("quadrilateral", 0.7, 2.0)
     for step in uem.time_steps(problem, 0.1, 0.4):

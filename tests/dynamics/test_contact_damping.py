@@ -114,7 +114,7 @@ def test_damped_vibration():
 
 
 def test_a_run_continues(folder):
-    """From a checkpoint amid the impact a run goes on to the last bit, with what has been dissipated, and a step is taken twice."""
+    """From a checkpoint amid the impact a run continues to the last bit, with what has been dissipated, and a step is taken twice."""
 
     def make():
         return Drop(uem.SoftContact(400.0, damping=20.0))

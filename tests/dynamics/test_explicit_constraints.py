@@ -201,7 +201,7 @@ def test_a_motor():
 
 @pytest.mark.slow
 def test_it_continues_from_a_checkpoint(tmp_path):
-    """A run with a motor, a rigid head and a hinge that stops and goes on ends as the one that does not."""
+    """A run with a motor, a rigid head and a hinge that stops and continues ends as the one that does not."""
     path = COMM.bcast(str(tmp_path / "run.h5") if COMM.rank == 0 else None)
 
     def plate():

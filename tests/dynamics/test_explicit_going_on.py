@@ -1,4 +1,4 @@
-"""Explicit runs that go on from a checkpoint."""
+"""Explicit runs that continue from a checkpoint."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parametrize("law", [uem.NeoHooke, uem.LinearElastic])
 @pytest.mark.parametrize("stop", [9, 15])
 def test_it_continues_from_a_checkpoint(tmp_path, law, stop):
-    """A run that stops before or during contact and goes on has the steps of the one that does not, and on one rank its last bits."""
+    """A run that stops before or during contact and continues has the steps of the one that does not, and on one rank its last bits."""
     path = COMM.bcast(str(tmp_path / "run.h5") if COMM.rank == 0 else None)
     whole, first, again = (Flight(2, 12, law=law, friction=0.3, speed=14.0) for _ in range(3))
     every = [(step.number, step.dt) for step in uem.time_steps(whole.problem, None, 0.6)]
@@ -35,7 +35,7 @@ def test_it_continues_from_a_checkpoint(tmp_path, law, stop):
 
 
 def test_steps_shortened_by_a_refusal_stay_short(monkeypatch, tmp_path):
-    """Steps are shorter from a refused one on, also in a run that goes on from a checkpoint after it."""
+    """Steps are shorter from a refused one on, also in a run that continues from a checkpoint after it."""
     path, step, limit = COMM.bcast(str(tmp_path / "run.h5")), ExplicitStepper.step, []
 
     def refusing(self, dt):

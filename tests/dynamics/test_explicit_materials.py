@@ -84,7 +84,7 @@ def test_cells_that_are_flattened():
 
 
 def test_cells_that_collapse():
-    """A run goes on with cells of a five-hundredth of their height, turned by a right angle, and ends at a two-thousandth."""
+    """A run continues with cells of a five-hundredth of their height, turned by a right angle, and ends at a two-thousandth."""
     bar = Bar(speed=0.0)
     stepper, config = ExplicitStepper(bar.problem), bar.problem.config
     for left in (0.5, 2e-3, 5e-4):
@@ -244,7 +244,7 @@ def test_a_step_returns_stresses_once(monkeypatch):
 
 
 def test_restart(tmp_path):
-    """A run that goes on from a checkpoint is the uninterrupted one to rounding, with the same steps."""
+    """A run that continues from a checkpoint is the uninterrupted one to rounding, with the same steps."""
     path = COMM.bcast(str(tmp_path / "kept"))
     whole, first, second = (Bar(uem.FinitePlasticity, 40, 3.0) for _ in range(3))
     lengths = [step.dt for step in uem.time_steps(whole.problem, end=0.2)]

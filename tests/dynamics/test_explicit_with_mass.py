@@ -346,7 +346,7 @@ def test_rings_at_the_speed_of_waves(speed):
 def test_a_ring_that_folds(tmp_path):
     """A rubber ring is thrown onto a floor, where it folds and touches itself, in steps that change.
 
-    The floor's impulses are its change of momentum to rounding, energy is conserved, and a run that goes on from a checkpoint is the same.
+    The floor's impulses are its change of momentum to rounding, energy is conserved, and a run continued from a checkpoint is the same.
     """
 
     problem, contact, stored = ring()

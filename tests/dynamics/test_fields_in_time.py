@@ -111,7 +111,7 @@ def test_heat_of_friction_in_time(how):
 
 
 def test_going_on_in_time(folder):
-    """Read from a checkpoint amid the impact, the run goes on to the last bit, on several ranks to rounding."""
+    """Read from a checkpoint amid the impact, the run continues to the last bit, on several ranks to rounding."""
     whole, first, last = Fall(1), Fall(1), Fall(1)
     rows = whole.go(0.04)
     first.go(0.02)

@@ -195,7 +195,7 @@ def test_a_mass_on_a_spring(law):
 
 @pytest.mark.slow
 def test_a_run_continues(folder):
-    """From a checkpoint the run goes on to the last bit, with full turns of the hinge, and a step is taken twice."""
+    """From a checkpoint the run continues to the last bit, with full turns of the hinge, and a step is taken twice."""
 
     def make():
         r = Row()

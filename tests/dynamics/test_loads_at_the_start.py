@@ -150,7 +150,7 @@ def test_a_support_that_is_removed():
 
 
 def test_resumed(folder):
-    """A run that goes on from the first step's checkpoint is the uninterrupted one to the last bit."""
+    """A run that continues from the first step's checkpoint is the uninterrupted one to the last bit."""
     whole, first, second = (Bar(law=uem.NeoHooke) for _ in range(3))
     whole.momenta(2e-3, 4)
     first.momenta(2e-3, 1, checkpoint=uem.Checkpoint(folder / "run"))

@@ -235,7 +235,7 @@ def test_the_same_on_any_ranks():
 
 
 def test_a_run_continues(folder):
-    """A run that is interrupted in contact goes on alike."""
+    """A run that is interrupted in contact continues alike."""
     path, ends = folder / "run.h5", []
     for stop, checkpoint in ((99, None), (8, path), (99, path)):
         bars = Bars(1.0, 2.0, along=0.6, narrow=0.1, friction=0.3)
@@ -320,7 +320,7 @@ def test_a_bar_at_rest(scheme):
 
 @pytest.mark.parametrize("masses", [uem.lumped_mass, slow(uem.consistent_mass)])
 def test_a_block_on_a_belt(masses):
-    """A block falls onto a belt: friction is mu times the force in every step that it slips, and in the end it goes with the belt."""
+    """A block falls onto a belt: friction is mu times the force in every step that it slips, and in the end it moves with the belt."""
     b, belt = (
         Bodies("quadrilateral", [box("quadrilateral", [0.0, 0.01], [2.0, 1.01], [4, 3])]),
         uem.RigidPlane((0.0, 0.0), (0.0, 1.0)),

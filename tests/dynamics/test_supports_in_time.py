@@ -108,7 +108,7 @@ def test_a_support_that_is_added_and_moves():
 
 
 def test_a_block_that_falls_onto_a_floor():
-    """Contact goes on across a release: momentum at the floor is that of the fall, to the length of a step."""
+    """Contact continues across a release: momentum at the floor is that of the fall, to the length of a step."""
     floor = uem.RigidPlane((0.0, -0.05), (0.0, 1.0))
     bar = Bar(n=10, gravity=(0.0, -9.0), contacts=lambda bar: [uem.Contact(bar.end, floor)])
     grip = uem.dirichlet(bar.V, bar.top, 1)

@@ -207,7 +207,7 @@ def test_instants_are_found():
     # to the first order: half of the way each time, to the departure of the bar of 50 elements
     assert (coarse - middle) / (middle - fine) == pytest.approx(2.0, rel=0.05)
     assert fine - (middle - fine) == pytest.approx(7 / 6, abs=0.01)
-    # the grid of the steps goes on as if nothing had been
+    # the grid of the steps continues as if nothing had been
     assert np.isclose(bar.steps[-1].time, 1.5, rtol=1e-14)
     grid = [s.time for s in bar.steps if abs(s.time / 0.02 - round(s.time / 0.02)) < 1e-9]
     assert len(grid) == 75

@@ -99,7 +99,7 @@ class TestWholeCircles:
         for make in (uem.consistent_mass, uem.lumped_mass):
             mass = make(cylinder(cell, degree).V, 2.0)
             assert mass.total == pytest.approx(2.0 * np.pi * R**2 * H, rel=1e-13)
-            # Hinton's lumping of quadratic triangles goes by the reference cell, where all radii are alike
+            # Hinton's lumping of quadratic triangles uses the reference cell, where all radii are alike
             if make is uem.consistent_mass or degree == 1:
                 assert mass.centre == pytest.approx([0.0, H / 2], abs=1e-13)
 

@@ -48,7 +48,7 @@ def test_crossings_are_those_of_a_slow_search(seed, g, size):
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
 @pytest.mark.parametrize(("height", "crosses"), [(1e-16, False), (-1e-16, False), (1e-12, False), (1e-9, True)])
 def test_points_that_ride_on_facets(height, crosses, size):
-    """A point that goes with a facet's corner crosses no facet by rounding; one that comes from clearly above it does."""
+    """A point that moves with a facet's corner crosses no facet by rounding; one that comes from clearly above it does."""
     x0 = size * np.array([[[0.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 0.0]]])
     for angle in (0.5, 1.5, 2.8):
         x1, reach = x0 @ rotation(2, angle).T, 0.1 * size

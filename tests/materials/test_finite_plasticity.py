@@ -76,7 +76,7 @@ def test_uniaxial_tension(comm, law):
 
 @pytest.mark.parametrize("cell, kind", [("quadrilateral", "plane_strain"), ("hexahedron", "3d")])
 def test_simple_shear(comm, cell, kind):
-    """Perfectly plastic shear is borne by FY / sqrt(3), however far it goes."""
+    """Perfectly plastic shear is borne by FY / sqrt(3), at any shear."""
     _, u = block(comm, cell)
     material = uem.FinitePlasticity(u, E, NU, FY, kind=kind)
     for gamma in np.linspace(0.0, 5.0, 251)[1:]:

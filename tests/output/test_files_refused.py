@@ -25,7 +25,7 @@ COMM = MPI.COMM_WORLD
 
 @pytest.fixture(autouse=True)
 def without_vtx(monkeypatch):
-    """ADIOS2 has its own ways to fail, and its files are not gone on with."""
+    """ADIOS2 has its own ways to fail, and its files are not continued."""
     monkeypatch.setattr(compat, "has_vtx", lambda: False)
 
 
@@ -80,7 +80,7 @@ def test_folder_where_a_file_should_be(ending, folder):
 
 @pytest.mark.parametrize("rank", sorted({0, COMM.size - 1}))
 def test_numbers_that_one_rank_cannot_write(rank, folder, monkeypatch):
-    """All ranks raise at the same step, and once there is space again the series goes on without a hole."""
+    """All ranks raise at the same step, and once there is space again the series continues without a hole."""
     problem = pressed(COMM, "quadrilateral")
     writer = uem.ResultsWriter(folder / "run", problem, fields=strains(problem))
     writer.write(0.0)

@@ -239,7 +239,7 @@ def test_nodal_average_is_taken_in_each_body(cell: str) -> None:
 
 
 def test_ranks_without_a_cell_write_along(folder: Path) -> None:
-    """One cell for all ranks: results and a picture as one rank makes them, and a checkpoint that one rank goes on from."""
+    """One cell for all ranks: results and a picture as one rank makes them, and a checkpoint that one rank continues from."""
 
     def press(comm: MPI.Comm, name: str) -> tuple[int, list[float]]:
         domain = mesh.create_unit_square(comm, 1, 1, mesh.CellType.quadrilateral)

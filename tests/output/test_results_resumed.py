@@ -1,6 +1,6 @@
-"""Results that go on, and results of another run, which are kept aside or refused: nothing is overwritten.
+"""Results that continue, and results of another run, which are kept aside or refused: nothing is overwritten.
 
-Read ``test_same_on_every_number_of_ranks`` and ``test_results_of_earlier_runs_are_kept`` first. That a run which is killed goes on with its
+Read ``test_same_on_every_number_of_ranks`` and ``test_results_of_earlier_runs_are_kept`` first. That a killed run continues with its
 results is tested with its load steps in ``restart/test_load_steps_resumed.py``.
 """
 
@@ -29,7 +29,7 @@ COMM = MPI.COMM_WORLD
 
 @pytest.fixture(autouse=True)
 def without_vtx(monkeypatch):
-    """ADIOS2 has its own ways to fail, and its files are not gone on with."""
+    """ADIOS2 has its own ways to fail, and its files are not continued."""
     monkeypatch.setattr(compat, "has_vtx", lambda: False)
 
 
@@ -71,7 +71,7 @@ def test_same_on_every_number_of_ranks(cell, degree, folder):
 
 @pytest.mark.parametrize("cell,degree", [("quadrilateral", 2), ("tetrahedron", 1)])
 def test_gone_on_with_on_another_number_of_ranks(cell, degree, folder):
-    """One rank begins, all go on; coordinates that no binary fraction is equal to are those of the input on both."""
+    """One rank begins, all continue; coordinates that no binary fraction is equal to are those of the input on both."""
 
     def run(comm, steps):
         domain = (mesh.create_rectangle if cell == "quadrilateral" else mesh.create_box)(
@@ -148,7 +148,7 @@ def test_tables_of_earlier_runs_are_kept(kind, folder):
 
 @pytest.mark.parametrize("kind", ["history", "energy"])
 def test_tables_resumed_without_a_checkpoint(kind, folder):
-    """A run that begins anew although its tables are to go on loses nothing: the whole table is kept aside as it was."""
+    """A run that begins anew although its tables are to continue loses nothing: the whole table is kept aside as it was."""
 
     def run():
         problem = Bar((0.0, -3.0)).problem

@@ -1,4 +1,4 @@
-"""Checkpoints: whatever is written on some ranks is read on others to the last bit, and a run goes on as if it had never stopped.
+"""Checkpoints: whatever is written on some ranks is read on others to the last bit, and a run continues as if it had never stopped.
 
 Two tests to read first: ``test_any_ranks_to_any_ranks`` (random values of every kind of Function, by their places alone) and
 ``test_going_on_is_not_having_stopped`` (bit for bit in serial).
@@ -295,7 +295,7 @@ def test_moving_rigid_surface(sliding, coupling, folder):
 
 
 def test_multigrid_continues_too(folder):
-    """What a preconditioner has learnt is no part of the state: a run that writes and one that reads go on from the same."""
+    """What a preconditioner has learnt is no part of the state: a run that writes and one that reads continue from the same."""
 
     def make():
         b = blocks(COMM, "quadrilateral", 8, 8)

@@ -44,7 +44,7 @@ def step_in(path):
 
 
 def test_interval_and_end(folder, caplog):
-    """Written every three steps and at the end; what was stopped loses no more than an interval and goes on, with a word about it."""
+    """Written every three steps and at the end; what was stopped loses no more than an interval and continues, with a word about it."""
     path = folder / "deeper" / "run"
     with pytest.raises(KeyboardInterrupt):
         counted(path, 20, stop=2)
@@ -174,7 +174,7 @@ def start(path, every):
 @serial
 @pytest.mark.slow
 def test_killed_without_warning(folder):
-    """kill -9 at any instant, four times over: the file is whole, at most one interval old, and the run goes on from it."""
+    """kill -9 at any instant, four times over: the file is whole, at most one interval old, and the run continues from it."""
     last = 0
     for wait in (0.0, 0.003, 0.011, 0.02):
         process = start(folder / "run", 2)

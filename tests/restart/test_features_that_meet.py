@@ -1,4 +1,4 @@
-"""Scenes in which several features meet: the same in all units, gone on with from a checkpoint, and after a failed attempt.
+"""Scenes in which several features meet: the same in all units, continued from a checkpoint, and after a failed attempt.
 
 The test to read first is ``test_units``.
 """
@@ -260,7 +260,7 @@ def test_units(make):
 
 @meetings
 def test_gone_on_with(make, tmp_path):
-    """A run that stops in mid-way, and goes on in a new problem, ends as the one left alone."""
+    """A run that stops in mid-way, and continues in a new problem, ends as the one left alone."""
     whole, path = make(1.0, 1.0), COMM.bcast(str(tmp_path / "run"))
     n = len(list(whole.steps()))
     first = make(1.0, 1.0)
@@ -308,7 +308,7 @@ def test_after_a_failed_attempt(make, iterations, monkeypatch):
     taken = [step.newton_iterations for step in whole.steps()]
 
     def again(problem, **how):
-        # the last step along an arc goes on from one that is not committed
+        # the last step along an arc continues from one that is not committed
         if np.array_equal(problem.u.x.array, problem.committed):
             most, problem.max_iterations = problem.max_iterations, iterations
             with suppress(uem.ConvergenceError):

@@ -1,4 +1,4 @@
-"""Long runs: what is interrupted and gone on from a checkpoint ends as if it had not been, tables included, and what is refused.
+"""Long runs: what is interrupted and continued from a checkpoint ends as if it had not been, tables included, and what is refused.
 
 Two tests to read first: ``test_interrupted_is_uninterrupted`` (an elastic-plastic impact, bit for bit in serial) and
 ``test_killed`` (kill -9 in mid-run).
@@ -82,7 +82,7 @@ def uninterrupted(rho=None):
 @pytest.mark.parametrize("rho", [None, 0.6])
 @pytest.mark.slow
 def test_interrupted_is_uninterrupted(rho, folder):
-    """Left twice in mid-run, in flight before the touch and in contact after steps that were cut, and gone on with each time."""
+    """Left twice in mid-run, in flight before the touch and in contact after steps that were cut, and continued each time."""
     scheme = None if rho is None else uem.generalised_alpha(rho)
     whole, steps, alone = uninterrupted(rho)
     assert any(s.touched for s in steps) and sum(s.cuts for s in steps) > 0 and len({s.dt for s in steps}) > 3
@@ -109,7 +109,7 @@ def test_interrupted_is_uninterrupted(rho, folder):
 
 @pytest.mark.slow
 def test_a_later_end(folder):
-    """A run that has come to its end goes on if the end is later, as if that had been the end from the beginning."""
+    """A run that has come to its end continues if the end is later, as if that had been the end from the beginning."""
     Impact().run(folder, end=0.12)
     assert Impact().run(folder, end=0.12) == []
     Impact().run(folder)
@@ -153,7 +153,7 @@ def test_ranks_change(writer, reader, folder):
     ],
 )
 def test_checkpoint_of_another_problem(other, match, folder):
-    """Statics and another kind of material do not go on from the file, and the problem stays as it was."""
+    """Statics and another kind of material do not continue from the file, and the problem stays as it was."""
     Impact(moving=False).run(folder, end=0.04)
     wrong = Impact(moving=False, **other)
     checkpoint = uem.Checkpoint(folder / "run")
@@ -169,7 +169,7 @@ def test_checkpoint_of_another_problem(other, match, folder):
 
 
 def test_checkpoint_of_statics(folder):
-    """Time steps do not go on from a static problem's file."""
+    """Time steps do not continue from a static problem's file."""
     static = Impact(dynamic=False)
     uem.write_checkpoint(folder / "run", static.problem.state())
     wrong = Impact()
@@ -219,7 +219,7 @@ def test_killed(folder):
 @serial
 @pytest.mark.slow
 def test_terminated(folder):
-    """SIGTERM in mid-run: the step is finished and written, the status is 143, and the run goes on to the same end."""
+    """SIGTERM in mid-run: the step is finished and written, the status is 143, and the run continues to the same end."""
     _, steps, alone = uninterrupted()
     path, n = folder / "run", len(steps)
     process = start(path, 10**6)
@@ -269,7 +269,7 @@ def test_times_far_from_zero():
 
 
 def test_errors_leave_the_last_step(monkeypatch):
-    """After a step that fails for good, and after a load that raises, forces are those of the last step, and it goes on from it."""
+    """After a step that fails for good, and after a load that raises, forces are those of the last step, and it continues from it."""
     impact = Impact(moving=False)
     list(uem.time_steps(impact.problem, DT, 0.04))
     problem, bodies = impact.problem, impact.problem.bodies

@@ -1,4 +1,4 @@
-"""Load steps with a checkpoint: what is interrupted and gone on with ends as if it had not been, fields and history included.
+"""Load steps with a checkpoint: what is interrupted and continued ends as if it had not been, fields and history included.
 
 The test to read first is ``test_interrupted_is_uninterrupted``.
 """
@@ -63,7 +63,7 @@ def kept(kind, folder):
 )
 @pytest.mark.parametrize("kind", RAMPS)
 def test_interrupted_is_uninterrupted(kind, stops, folder):
-    """Left in mid-run, in the first call of ``load_steps`` or in a later one, once or several times, and gone on with."""
+    """Left in mid-run, in the first call of ``load_steps`` or in a later one, once or several times, and continued."""
     _, steps, _ = uninterrupted(kind)
     done, made = 0, 0
     for stop in stops:
@@ -111,7 +111,7 @@ def test_begun_by_the_load_steps(folder):
 
 
 def test_read_back(folder):
-    """A state that is read back in the same run is gone on from by the next call."""
+    """A state that is read back in the same run is continued from by the next call."""
     one = RAMPS["loaded"](COMM)
     state = one.problem.state()
     (_, n), *_ = one.calls
@@ -144,7 +144,7 @@ RAMPS[{kind!r}](COMM).run(Path({folder!r}), every=2)
 @pytest.mark.parametrize("kind", ["sliding", "plastic"])
 @pytest.mark.slow
 def test_killed(kind, folder):
-    """kill -9 twice in mid-run: files are whole whenever it comes, and the run that goes on ends in the very same ones."""
+    """kill -9 twice in mid-run: files are whole whenever it comes, and the run that continues ends in the very same ones."""
     for count in (3, 2):
         process = start_process(RUN.format(kind=kind, folder=str(folder)))
         for _ in range(count):

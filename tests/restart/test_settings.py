@@ -1,4 +1,4 @@
-"""Runs that go on with something else than they began with name it; so are what differs between ranks, and lost times.
+"""Runs that continue with something else than they began with name it; so are what differs between ranks, and lost times.
 
 Read ``test_other_settings_are_named`` first.
 """
@@ -66,7 +66,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("what", OTHERS)
 def test_other_settings_are_named(what, folder):
-    """All that differs, now and then; the same run goes on, and one that is to go on with something else can."""
+    """All that differs, now and then; the same run continues, and one that is to continue with something else can."""
     same, other, words = OTHERS[what]
     problem = made(**same)
     uem.write_checkpoint(folder / "run", problem.state())
@@ -105,7 +105,7 @@ def without(path, name):
 
 @pytest.mark.parametrize("name", BY_DEFAULT)
 def test_settings_that_came_later(name, folder):
-    """A file that does not know of a setting is of a run that had it by default: that goes on, one with another value is refused."""
+    """A file that does not know of a setting is of a run that had it by default: that continues, one with another value is refused."""
     same, other = BY_DEFAULT[name]
     uem.write_checkpoint(folder / "run", made(**same).state())
     without(folder / "run", name)
@@ -139,7 +139,7 @@ def test_other_steps_are_reported(folder, caplog):
 
 
 def test_one_checkpoint_for_two_problems(folder):
-    """The second would be written over the first's, or be gone on with from it."""
+    """The second would be written over the first's, or be continued from it."""
     first, second, checkpoint = made(friction=0.0), made(friction=0.0), uem.Checkpoint(folder / "run")
     for _ in uem.time_steps(first, 0.01, 0.01, checkpoint=checkpoint):
         pass

@@ -1,4 +1,4 @@
-"""Tables that go on with a run: what is made before the checkpoint is read refuses its first row."""
+"""Tables that continue with a run: what is made before the checkpoint is read refuses its first row."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import uem_dolfinx as uem
 
 @pytest.mark.parametrize("kind", ["energy", "history"])
 def test_table_made_before_the_checkpoint_is_read(kind, folder):
-    """It refuses the first row and leaves the file alone; made after the checkpoint was read it goes on."""
+    """It refuses the first row and leaves the file alone; made after the checkpoint was read it continues."""
 
     def run(end, early):
         bar, checkpoint = Bar((0.0, -3.0)), Killed(folder / "run", every=2)

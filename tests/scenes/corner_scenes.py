@@ -49,7 +49,7 @@ def groove(
     cell: str, angle: float, apex: float, start: float, shift: Any, push: Any, *, tilt: float | None = None, degree: int = 1,
     swap: bool = False, floor: bool = False, path: Any = None, n: int = 2, **how: Any,
 ) -> InCorner:  # fmt: skip
-    """A wedge in a groove that opens by ``angle``; in space both go on along the third axis.
+    """A wedge in a groove that opens by ``angle``; in space both continue along the third axis.
 
     Args:
         cell: kind of all cells.

@@ -211,7 +211,7 @@ def folded(
 
 
 def continues_from_checkpoints(begun, folder):
-    """Assert that a run of four steps that goes on from a checkpoint ends like one that was left alone.
+    """Assert that a run of four steps that continues from a checkpoint ends like one that was left alone.
 
     Args:
         begun: makes the scene, with its ``problem``.

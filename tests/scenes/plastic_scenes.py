@@ -150,7 +150,7 @@ class Masing:
     """Stress over strain in tension by Masing's rule, the plastic strain, and work.
 
     After a reversal the stress follows the virgin curve, twice as large, until the strain of the reversal before; there the older curve
-    goes on [Proc. 2nd Int. Congr. Applied Mechanics, Zurich (1926) 332-335].
+    continues [Proc. 2nd Int. Congr. Applied Mechanics, Zurich (1926) 332-335].
     """
 
     def __init__(self, table: list[tuple[float, float]], stiffness: float = E, yield_stress: float = FY):

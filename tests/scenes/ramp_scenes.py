@@ -1,4 +1,4 @@
-"""Load steps that are interrupted and gone on with: scenes in each of which something else must be kept."""
+"""Load steps that are interrupted and continued: scenes in each of which something else must be kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs that are interrupted and gone on with: scenes for the tests of checkpoints and for the processes that these start."""
+"""Runs that are interrupted and continued: scenes for the tests of checkpoints and for the processes that these start."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def test_without_history():
 
 @pytest.mark.slow
 def test_a_refused_step_leaves_nothing():
-    """After a tolerance that no step reaches the body goes on as another that has not tried."""
+    """After a tolerance that no step reaches the body continues as another that has not tried."""
     problem, new = forming(COMM).problem, forming(COMM).problem
     refused(uem.StepAccuracyError, ["tolerance", "no better"], lambda: list(uem.load_steps(problem, 1, tolerance=1e-13)))
     elastic = problem.progress.factor
@@ -167,7 +167,7 @@ def test_what_is_refused():
 
 @pytest.mark.slow
 def test_gone_on_with(folder):
-    """A run that is left and gone on with takes the same steps to the same end."""
+    """A run that is left and continued takes the same steps to the same end."""
     whole, steps = formed(1, 1e-3)
     for stop in (3, 99):
         problem = forming(COMM).problem

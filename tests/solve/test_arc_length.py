@@ -116,7 +116,7 @@ def test_arch_snaps_through():
 
 
 def test_length_of_the_arc():
-    """Every step but the first and the last goes as far as the one before, along it; a state is closed only there."""
+    """Every step except the first and the last is as long as the one before, along it; a state is closed only there."""
     arch, ends = Arch(), []
     for _ in uem.load_steps(arch.problem, 10, arc_length=True):
         ends.append(arch.problem.bodies.displacement())
@@ -179,7 +179,7 @@ def test_loads_that_are_not_proportional():
 
 @pytest.mark.slow
 def test_resumed_on_the_way(tmp_path_factory):
-    """A run that is ended past the limit point goes on from its checkpoint to the same last state."""
+    """A run that is ended past the limit point continues from its checkpoint to the same last state."""
     folder = COMM.bcast(tmp_path_factory.mktemp("arc") if COMM.rank == 0 else None)
     whole, first, second = Arch(), Arch(), Arch()
     path = whole.path(5)
@@ -213,7 +213,7 @@ def test_what_cannot_be_led():
 
 
 def test_several_loads():
-    """Each Constant goes its own way: in proportion, or as its function says."""
+    """Each Constant follows its own rule: in proportion, or as its function says."""
     seen = []
     arch = Arch(lambda a: {a.q: lambda s: 0.3 * shallow(LIMIT) * min(2 * s, 1.0), a.p: (0.0, 0.2 * shallow(LIMIT))})
     for _ in uem.load_steps(arch.problem, 4):

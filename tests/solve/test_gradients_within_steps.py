@@ -114,7 +114,7 @@ def recorded(s, path):
 
 
 def in_steps(s, path):
-    """The second of two Steps, with an offset; a Constant goes on from its value in the first, another from nothing."""
+    """The second of two Steps, with an offset; a Constant continues from its value in the first, another from nothing."""
     problem, c, v = s.problem(), s.constants, s.values
     first = uem.Step("first", 1, loads={c["pull"]: v["pull"] - 0.5 * FULL["pull"]})
     second = uem.Step("second", 4, loads={c["pull"]: v["pull"], c["shear"]: v["shear"]}, offset={s.contact: v["offset"]})
@@ -131,7 +131,7 @@ def at_once(s, path):
 
 
 def resumed(s, path):
-    """Steps gone on with from a checkpoint in the second of two calls."""
+    """Steps continued from a checkpoint in the second of two calls."""
     for until_now in (0.5, 0.75):
         problem = s.problem(s.load())
         for calls, factor in ((1, 1.0), (4, until_now)):

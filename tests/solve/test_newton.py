@@ -241,7 +241,7 @@ def test_failure_restores_the_committed_state():
         assert np.array_equal(getattr(contact.pair.trial, field), getattr(before[1], field))
     assert np.array_equal(contact.resultant().force, before[2])
     assert np.array_equal(contact.pressure.x.array, before[3])
-    # and the same problem goes on
+    # and the same problem continues
     problem.max_iterations = 50
     assert problem.solve()[-1].residual <= 1e-10
 

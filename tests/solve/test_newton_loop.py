@@ -110,7 +110,7 @@ def test_what_the_line_search_accepts(left, yields, length):
 
 @pytest.mark.parametrize("convex", [False, True])
 def test_steps_go_on_downhill(convex):
-    """Past a limit point forces grow at first: with a convex tangent steps go on as long as these drive the body that way."""
+    """Past a limit point forces grow at first: with a convex tangent steps continue as long as these drive the body that way."""
 
     class Hill(OneUnknown):
         """Its energy, ``cos u``, falls until u = pi; the tangent has no more than the step's sign."""

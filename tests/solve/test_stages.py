@@ -108,7 +108,7 @@ def test_a_step_that_is_left_continues_with_what_is_left():
 
 @pytest.mark.parametrize("stops", [slow((3,)), (6, 2)], ids=str)
 def test_interrupted_is_uninterrupted(stops, folder):
-    """Left in the middle of a step, and gone on with by the same script: the same numbers, in serial bit by bit; results go on."""
+    """Left in the middle of a step, and continued by the same script: the same numbers, in serial bit by bit; results continue."""
 
     def run(name, stop=None):
         column, made = Column(friction=0.1), []
@@ -143,7 +143,7 @@ def test_interrupted_is_uninterrupted(stops, folder):
 
 @pytest.mark.parametrize("stop", [6, slow(4), 8])
 def test_a_list_that_is_left_is_left_again(stop, folder):
-    """A script leaves a list by ``break`` amid a release, goes on with another, and is run anew from a checkpoint of before or after."""
+    """A script leaves a list by ``break`` amid a release, continues with another, and is run anew from a checkpoint of before or after."""
 
     def run(name, stop=None):
         column, made = Column(friction=0.1), []
@@ -188,7 +188,7 @@ def test_another_step_is_no_step_of_the_checkpoint(folder):
 
 
 def test_equations_go_on(folder):
-    """Between steps, where what the top carries is released, a run that goes on knows what an equation carries there."""
+    """Between steps, where what the top carries is released, a run that continues knows what an equation carries there."""
 
     def run(name, stop=None):
         squeezed, made = uem.Equation([((0.5, 1.0), (0.0, 1.0)), ((0.5, 0.5), (0.0, -1.0))], -0.004), []
