@@ -180,10 +180,13 @@ def test_terms_of_equations_in_local_directions(folder):
 RIGID = "*NODE\n900, 0.5, 0.5, 3.\n901, 0., 0., 0.\n*RIGID BODY, NSET=head 1, REF NODE=900{}\n"
 BODIES = {
     "pushed": (", ROT NODE=901", "*CLOAD\n900, 3, -100.\n", (0.0, 0.0, -0.2)),
+    "pushed along a local axis": (
+        ", ROT NODE=901\n*NSET, NSET=at\n900\n*TRANSFORM, NSET=at\n0., 0., 1., 1., 0., 0.", "*CLOAD\n900, 1, -100.\n", (0.0, 0.0, -0.2),
+    ),
     "led": (", ROT NODE=901", "*BOUNDARY\n900, 3, 3, -0.02\n901, 1, 3\n", (0.0, 0.0, -0.02)),
     "turned": (", ROT NODE=901", "*BOUNDARY\n900, 1, 3\n901, 1, 1, 0.01\n901, 2, 3\n", (0.0, 0.01, -0.005)),
     "turned as in Abaqus": ("", "*BOUNDARY\n900, 1, 3\n900, 4, 4, 0.01\n900, 5, 6\n", (0.0, 0.01, -0.005)),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BODIES)
