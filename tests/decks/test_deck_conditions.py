@@ -200,6 +200,17 @@ def test_rigid_bodies(folder, case):
     assert not deck.left_out
 
 
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [("1, 1, 0.01", ("reference node 900", "global axis")), ("4, 4, 0.01", ("degree of freedom 4", "*TRANSFORM"))],
+)
+def test_rigid_bodies_in_local_directions(folder, row, said):
+    """A reference node is not held in an inclined direction, nor are rotations of the node with a *TRANSFORM."""
+    how = "\n*NSET, NSET=at\n900\n*TRANSFORM, NSET=at\n0.6, 0., 0.8, 0., 1., 0."
+    text = column(f"*BOUNDARY\n900, {row}\n", thickness=RIGID.format(how), held="*BOUNDARY\nfoot 1, 1, 3\n")
+    refused(uem.InputError, said, lambda: read(folder, text))
+
+
 def test_thickness(folder):
     """Forces act on the thickness of plane bodies, pressures on an area; the deck says what contacts mean."""
     text = column("*CLOAD\nhead 1, 2, -5.\n", "*CLOAD, OP=NEW\n*DLOAD\n11, P3, 10.\n", kind="CPS4", thickness="0.1\n", held=FLAT)

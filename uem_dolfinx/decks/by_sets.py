@@ -99,6 +99,11 @@ class Closing:
 
     def _turn(self) -> None:
         """Let values in local directions be those in global ones, forces those of a thickness of 1, and terms of equations vectors."""
+        for one, dof in [at for step in self.model.steps for at in (*step.held, *step.forces)]:
+            if one in self._axes and 3 < dof <= 6:
+                raise InputError(
+                    f"degree of freedom {dof} of node {one} with a *TRANSFORM: expected rotations without one, or a ROT NODE"
+                )
         for step in self.model.steps:
             turned: Acting = {}
             for (one, dof), value in step.forces.items():
@@ -123,6 +128,8 @@ class Closing:
             if len(along) == 1:
                 c = int(along[0])
                 turned[one, c + 1] = [value if value is None else value * float(axis[c]) for value in values]
+            elif one in self.model.references:
+                raise InputError(f"*BOUNDARY of reference node {one} in a local direction: expected one along a global axis")
             elif any(value is None for value in values):
                 raise InputError(
                     f"*BOUNDARY of node {one} in a local direction: expected it in all steps, or no *TRANSFORM there"
