@@ -71,16 +71,28 @@ def test_the_plastic_wave(law, coupling):
 
 
 def test_cells_that_are_flattened():
-    """The critical step is found anew before cells are flattened by a tenth; cells at rest are looked at as rarely as there may be."""
+    """The critical step is found anew before a cell is flattened by a tenth since then; cells at rest are looked at as rarely as may be."""
     bar = Bar(speed=0.0)
-    stepper = ExplicitStepper(bar.problem)
+    stepper, X = ExplicitStepper(bar.problem), bar.problem.config.X
+    u, v = (f.x.array.reshape(-1, 2) for f in (bar.u, bar.dynamics.velocity))
     stepper.look()
-    assert stepper.steps_to_look(1e-3, 0.09) == 50
-    bar.dynamics.velocity.x.array.reshape(-1, 2)[:, 1] = -7.0 * bar.problem.config.X[:, 1]
+    assert stepper.steps_to_look(1e-3) == 50
+    v[:, 1] = -7.0 * X[:, 1]
     stepper.look()
-    assert stepper.steps_to_look(1e-3, 0.0) == 14
-    assert stepper.steps_to_look(1e-3, 0.05) == 7
-    assert stepper.steps_to_look(1.0, 0.0) == 0 == stepper.steps_to_look(1e-3, 0.2)
+    assert stepper.steps_to_look(1e-3) == 14 and stepper.steps_to_look(1.0) == 0
+    # cells are strained by 0.05, and by 0.2
+    for left, steps in ((0.9535, 6), (0.845, 0)):
+        u[:, 1] = (left - 1.0) * X[:, 1]
+        stepper.look()
+        assert (stepper.steps_to_look(1e-3), stepper.steps_to_look(1e-3, anew=True)) == (steps, int(0.1 * left / 7e-3))
+    stepper.count_from(bar.u.x.array)
+    stepper.look()
+    assert stepper.steps_to_look(1e-3) == stepper.steps_to_look(1e-3, anew=True) == 12
+    # those that are strained are not those that go on
+    u[:, 1], v[:, 1] = -0.05 * np.minimum(X[:, 1], 5.0), -7.0 * np.maximum(X[:, 1] - 5.0, 0.0)
+    stepper.count_from(0.0 * bar.u.x.array)
+    stepper.look()
+    assert stepper.steps_to_look(1e-3) == 14
 
 
 def test_cells_that_collapse():

@@ -303,18 +303,34 @@ class Restriction:
         np.add.at(t, eq.node, -along[:, None] * eq.direction)
         return t
 
+    @cached_property
+    def _moving(self) -> Ints:
+        """Nodes with free components."""
+        return np.flatnonzero(self.free.any(axis=1))
+
+    def _free_part(self, values: Array) -> Array:
+        """Values of owned nodes ``(n_owned, block)`` with zeros at components that are not free; quick where few nodes are."""
+        if 2 * len(at := self._moving) > len(values):
+            return values * self.free
+        found = np.zeros(values.shape)
+        found[at] = values[at] * self.free[at]
+        return found
+
     def expand(self, dq: PETSc.Vec) -> PETSc.Vec:
         """``P dq``, without c."""
         q = dq.array_r.reshape(-1, self.space.block)
-        du = q * self.free
+        du = self._free_part(q)
         du[self.nodes] = np.einsum("kij,kj->ki", self.frames, q[self.nodes])
         return self._series(self.space.vector(du))
 
     def pass_on(self, F: PETSc.Vec) -> PETSc.Vec:
-        """Transfer the contactors' forces to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F`` (collective)."""
-        part = F.array_r.reshape(-1, self.space.block)
+        """Transfer the contactors' forces to their targets [UEM, 4.3]: ``(1 + M + M^2 + ...)' F`` (collective).
+
+        It is F itself where no equation follows a node.
+        """
         if not self.chain:
-            return self.space.vector(part)
+            return F
+        part = F.array_r.reshape(-1, self.space.block)
         total, eq = part.copy(), self._held
         for _ in range(self.chain):
             along = np.einsum("mg,mg->m", self.lift[self.equations.active], part[eq.node])
@@ -326,7 +342,7 @@ class Restriction:
     def reduce(self, y: PETSc.Vec) -> PETSc.Vec:
         """``T' y``; with y from ``pass_on`` this is ``P'F``."""
         full = y.array_r.reshape(-1, self.space.block)
-        q = full * self.free
+        q = self._free_part(full)
         q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
         return self.space.vector(q)
 

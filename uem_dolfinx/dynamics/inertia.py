@@ -25,7 +25,7 @@ from uem_dolfinx.dynamics.scheme import CentralDifferences, Scheme, newmark
 from uem_dolfinx.errors import InputError, InputTypeError, NotFiniteError, SpaceError
 from uem_dolfinx.geometry.axisymmetry import revolved
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.log import timed_as
+from uem_dolfinx.log import timed
 from uem_dolfinx.parallel import agree, agreed, ask_together, reduced
 
 if TYPE_CHECKING:
@@ -102,6 +102,7 @@ class Dynamics(given.Sealed):
         self.resumed, self.accelerated, self.moving, self._attached = 0, False, False, False
         #: Length of the last committed step, zero before the first, and the factor of M in the tangent.
         self.last = self.factor = self.driven = self.struck = self.dt = 0.0
+        self._ends: tuple[Array, Array] | None = None  # velocity and acceleration at the end of an explicit step, once known
         self.added: list[AddedMass] = []  #: Masses at points of rigid couplings.
         self.damping_form: ufl.Form | None = None  #: Virtual work of the damping forces.
 
@@ -213,7 +214,7 @@ class Dynamics(given.Sealed):
 
     def begin(self, dt: float) -> None:
         """Begin a step of length ``dt`` from the committed state."""
-        self._until, self.moving, self.dt = self.time + dt, True, dt
+        self._until, self.moving, self.dt, self._ends = self.time + dt, True, dt, None
         ends = self.scheme.ending(self._velocity, self._acceleration, dt)
         self._a_rate, self._a_past, self._v_rate, self._v_past = ends
         self.factor = self.scheme.factor(dt)
@@ -301,13 +302,13 @@ class Dynamics(given.Sealed):
             if rate is not None:
                 self._rate.value = rate
 
-    @timed_as("inertia forces")
     def load(self) -> Array | None:
         """Inertia forces, which explicit steps find from others, minus weight, to add to residuals ``(n,)``; None for zero (collective)."""
         if self.moving and self.scheme.explicit:
             return -self._weight if self._down.any() else None
-        load = (self._inertia() if self.moving else self.forces.x.array[: self._n]) - self._weight
-        return load + self.added_forces() if self.added else load
+        with timed("inertia forces"):
+            load = (self._inertia() if self.moving else self.forces.x.array[: self._n]) - self._weight
+            return load + self.added_forces() if self.added else load
 
     def added_forces(self, carried: bool = False) -> Array:
         """Nodal inertia forces minus weight of masses at points, present or as last committed (``carried``) ``(n,)`` (collective)."""
@@ -319,8 +320,11 @@ class Dynamics(given.Sealed):
     def _inertia(self, prescribed: tuple[Array, Array, Array] | None = None) -> Array:
         """``(M ((1 - alpha_m) a(n+1) + alpha_m a(n)) - alpha_f I(n)) / (1 - alpha_f)``, which balances G at n + 1 ``(n,)``."""
         s, n = self.scheme, self._n
-        du = self._displacement - self._u
-        a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
+        if self._ends is None:
+            du = self._displacement - self._u
+            a = (1.0 - s.alpha_m) * (self._a_rate * du + self._a_past) + s.alpha_m * self._acceleration
+        else:
+            a = self._ends[1].copy()
         a[self._at_held] = (prescribed or self._prescribed())[2]
         inertia = self.mass.times(a[:n])
         return (inertia - s.alpha_f * self.forces.x.array[:n]) / (1.0 - s.alpha_f) if s.alpha_f else inertia
@@ -350,8 +354,11 @@ class Dynamics(given.Sealed):
         """Velocity and acceleration at the end of the present step, at the present displacement, ``(n,)`` each."""
         n, held, massy = self._n, self._at_held, self.massy.ravel()
         end, mean, _ = prescribed or self._prescribed()
-        du = (self._displacement - self._u)[:n]
-        a, v = self._a_rate * du + self._a_past[:n], self._v_rate * du + self._v_past[:n]
+        du = self._displacement[:n] - self._u[:n]
+        if self._ends is None:
+            v, a = self._v_rate * du + self._v_past[:n], self._a_rate * du + self._a_past[:n]
+        else:
+            v, a = (one.copy() for one in self._ends)
         a[held], v[held] = mean, end
         # components without mass have the mean velocity of the step
         return np.where(massy, v, du / self.dt), np.where(massy, a, 0.0)
@@ -362,9 +369,10 @@ class Dynamics(given.Sealed):
             n, dt, i = self._n, self.dt, self._at_held
             self.forces.x.array[:n] = self._inertia(known := self._prescribed())
             self.velocity.x.array[:n], self.acceleration.x.array[:n] = self.rates(known)
-            self.mean_velocity.x.array[:n] = (self._displacement - self._u)[:n] / dt
-            change = self.velocity.x.array[:n] - self._velocity[:n]
-            self.driven += float((self.mass.times(change)[i] * (self._velocity[i] + 0.5 * change[i])).sum())
+            self.mean_velocity.x.array[:n] = (self._displacement[:n] - self._u[:n]) / dt
+            if len(i) or not self.mass.diagonal:
+                change = self.velocity.x.array[:n] - self._velocity[:n]
+                self.driven += float((self.mass.times(change)[i] * (self._velocity[i] + 0.5 * change[i])).sum())
             for field in (self.forces, self.acceleration, self.velocity, self.mean_velocity):
                 field.x.scatter_forward()
             self.time, self.last, self.moving = self._until, dt, False
@@ -378,7 +386,7 @@ class Dynamics(given.Sealed):
         ``struck`` is the work of contact and equations on masses in this step.
         """
         self.struck += struck
-        self._v_rate, self._v_past[: self._n], self._a_past[: self._n] = 0.0, velocity, acceleration
+        self._ends = velocity, acceleration
 
     def change_rates(self, velocity: Array, acceleration: Array, part: float = 1.0) -> None:
         """Replace velocity and acceleration of free components of the committed state ``(n,)`` (collective).

@@ -66,14 +66,14 @@ class Nodes:
         return np.asarray(self.index_map.local_to_global(flat), dtype=np.int64).reshape(nodes.shape)
 
     @cached_property
-    def _like(self) -> PETSc.Vec:
-        """Template for vectors."""
+    def like(self) -> PETSc.Vec:
+        """Template for vectors, whose values do not count."""
         sizes = self.block * self.n_owned, self.block * self.n_global
         return forms.Vector().createMPI(sizes, bsize=self.block, comm=self.comm)
 
     def vector(self, values: npt.ArrayLike | None = None) -> PETSc.Vec:
         """A vector with these values at the owned components, or zeros."""
-        v = self._like.duplicate()
+        v = self.like.duplicate()
         v.array[:] = 0.0 if values is None else np.asarray(values).reshape(-1)
         return v
 

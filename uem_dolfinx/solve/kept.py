@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.restart.state import State
 from uem_dolfinx.solve.loading import from_checkpoint, to_checkpoint
 
@@ -15,6 +16,7 @@ def state_of(problem: Any) -> State:
     """Functions and numbers of a problem, from which its run continues as if uninterrupted (collective)."""
     stiffness, own, config = fem.Function(problem.config.V), problem.config.functions(), problem.config
     starts = {name: fem.Function(f.function_space) for name, f in own.items()}
+    of_equations, known_at = fem.Function(config.V), fem.Function(config.V)
     functions = own | {"stiffness": stiffness}
     carried = {name: fem.Function(f.function_space) for name, f in own.items()}
     for i, pair in enumerate(problem.pairs, 1):
@@ -30,9 +32,10 @@ def state_of(problem: Any) -> State:
         functions["mean velocity"] = d.mean_velocity
         if d.damping is not None:
             functions["velocity in damping"] = d.past
+        if is_explicit(d):
+            functions["displacement at the critical step"] = known_at
     for i, material in enumerate(problem.materials, 1):
         functions |= {f"{name} {i}": f for name, f in material.history.items()}
-    of_equations = fem.Function(config.V)
     if problem.linear is not None:
         functions["multipliers of equations"] = of_equations
     settings = problem.settings.describe(problem.comm)
@@ -60,6 +63,8 @@ def state_of(problem: Any) -> State:
             of_equations.x.scatter_forward()
         if problem.dynamics is not None:
             state.numbers |= problem.dynamics.to_checkpoint() | problem.step_control.to_checkpoint()
+            if len(at := problem.step_control.known_at):
+                known_at.x.array[:] = at
         if problem.linear is not None and problem.linear.turns:
             state.numbers["turns of couplings"] = problem.linear.turns
 
@@ -80,6 +85,8 @@ def state_of(problem: Any) -> State:
         if problem.dynamics is not None:
             problem.dynamics.from_checkpoint(state.numbers)
             problem.step_control.from_checkpoint(state.numbers)
+            if is_explicit(problem.dynamics):
+                problem.step_control.known_at = np.array(known_at.x.array)
         at = problem.progress.factor if problem.dynamics is None else problem.dynamics.time
         for contact in problem.contacts:
             contact.take_load(at, known=True)

@@ -389,7 +389,7 @@ class UnitedProblem(given.Sealed):
         if self.history is not None:
             self.history.note(self._before, self.led[2])
         pairs, self.committed = self.interfaces, np.array(self.u.x.array)
-        self.largest_forces = np.maximum(self.largest_forces, self.bodies.remembered(bool(self.pairs)))
+        self.largest_forces = self.bodies.remembered(bool(self.pairs), self.largest_forces)
         parts: list[Any] = [self.bodies, self.solver, self.impacts or self.dynamics]
         for part in filter(None, parts):
             part.commit()

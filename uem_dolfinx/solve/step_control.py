@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from uem_dolfinx import errors
+from uem_dolfinx.arrays import Array
 from uem_dolfinx.log import logger
 
 #: A step may be cut to this part of its nominal length.
@@ -44,7 +45,7 @@ class StepControl:
         largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
         accurate: longest step that errors of the last ones in time let expect to be accurate.
         due: number of the step after which explicit steps look at how fast cells are strained.
-        stretch: their strain until then, since the critical step was found.
+        known_at: displacement where the critical step was last found, from where strains count, ghosts included ``(n,)``.
         resolved: bound on the length of explicit steps that resolve contacts on a stiff surface.
         of_contact: whether contacts change the critical step of explicit steps.
         shortest: height of a cell when explicit steps last looked at them, a length.
@@ -52,8 +53,9 @@ class StepControl:
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
-        self._cuts, self._read, self._longest_before, self.due, self.stretch, self.resolved = 0, False, np.inf, 0, 0.0, np.inf
+        self._cuts, self._read, self._longest_before, self.due, self.resolved = 0, False, np.inf, 0, np.inf
         self.of_contact, self.shortest, self.accurate = False, np.inf, np.inf
+        self.known_at: Array = np.zeros(0)
         self._failed: list[object] = []  # history of the last attempt of this step, which failed
 
     def begin(self, nominal: float) -> None:
@@ -150,7 +152,6 @@ class StepControl:
             "largest speed": self.largest_speed,
             "accurate step": self.accurate,
             "critical step due": self.due,
-            "stretch of cells": self.stretch,
             "resolved step": self.resolved,
             "steps of contact": self.of_contact,
             "least height": self.shortest,
@@ -160,12 +161,12 @@ class StepControl:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
         # files of earlier versions lack these
         kept = {
-            "largest speed": 0.0, "accurate step": np.inf, "critical step due": 0, "stretch of cells": np.inf, "resolved step": np.inf,
+            "largest speed": 0.0, "accurate step": np.inf, "critical step due": 0, "resolved step": np.inf,
             "least height": np.inf,
         } | kept  # fmt: skip
         kept.setdefault("steps of contact", False)
         (
-            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.accurate, self.due, self.stretch,
+            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.accurate, self.due,
             self.resolved, self.of_contact, self.shortest,
         ) = (kept[name] for name in self.to_checkpoint())  # fmt: skip
         self._read, self._longest_before = True, self.longest

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -25,7 +27,7 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.errors import LinearSolveError
 from uem_dolfinx.geometry.nodes import Nodes
 from uem_dolfinx.log import compiling, timed
-from uem_dolfinx.parallel import gathered
+from uem_dolfinx.parallel import gathered, reduced
 
 
 class PartSolver(UnitedSolver):
@@ -96,13 +98,13 @@ class PartSolver(UnitedSolver):
     def solve(self, rhs: PETSc.Vec, accuracy: float = 0.0, near: PETSc.Vec | None = None) -> tuple[PETSc.Vec, int]:
         """Solve for dq, and 1 for the number of linear iterations; LinearSolveError if the matrix is singular (collective)."""
         with timed("linear solve"):
-            dq = self.space.vector(self._uncoupled(rhs))
+            dq, found = self.space.vector(self._uncoupled(rhs)), np.zeros(0)
             if self._pc is not None:
                 used = self._used[self._at]
                 self._rhs.array[:] = np.where(used, rhs.array_r[self._at], 0.0)
                 self._pc.apply(self._rhs, self._dq)
-                dq.array[self._at] = np.where(used, self._dq.array_r, 0.0)
-        if np.isfinite(dq.norm()):
+                dq.array[self._at] = found = np.where(used, self._dq.array_r, 0.0)
+        if reduced(self.space.comm, bool(np.isfinite(found).all()), op=MPI.LAND):
             return dq, 1
         raise LinearSolveError(
             "the united system of an explicit step is singular: equations conflict, a surface without mass is loose, or friction leaves "
@@ -236,7 +238,10 @@ class Prediction:
         self.kept = self.kept and len(history) <= ITERATIONS_OF_KEPT + 1 and not any(one.changed for one in history)
 
     def predict(self, start: Any) -> None:
-        """Move nodes with mass to ``start (n,)``, ghosts included, and the surface from there into equilibrium with the last contact."""
+        """Move nodes with mass to ``start (n,)``, ghosts included, and the surface from there into equilibrium with the last contact.
+
+        ``start`` gets the values of conditions.
+        """
         problem, bodies, system = self.problem, self.problem.bodies, self.system
         if system.rows is None:
             # the first step of a continued run
@@ -244,9 +249,8 @@ class Prediction:
         system.rows_of_last()
         if not self.kept:
             self._prepare()
-        u = np.array(start)
-        compat.set_bc_values(u, bodies.bcs)
-        bodies.u.x.array[:] = u
+        compat.set_bc_values(start, bodies.bcs)
+        bodies.u.x.array[:] = start
         bodies.u.x.scatter_forward()
         fine, before = self._assemble(), np.inf
         enough = problem.rtol * bodies.residual.norm()

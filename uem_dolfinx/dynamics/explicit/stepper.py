@@ -119,13 +119,13 @@ class ExplicitStepper:
             points = points[np.isin(points, (points.min(), points.max())).all(axis=1)]
         #: Derivatives of the shape functions of vertices by reference coordinates ``(tdim * n_points, n_vertices)``.
         self._derivatives = np.concatenate(forms.create_lagrange_element(cell, 1).tabulate(1, points)[1:, :, :, 0])
-        #: Least height of the cells, and the fastest rate of strain, as last looked at.
-        self.shortest, self.rate = np.inf, 0.0
-        #: Cells that are treated at once, and their slopes in the mesh as it was read, in short numbers: strains need no more.
+        #: Least height of the cells, and the times until one is strained as far as it may, as it is and without strain, as last looked at.
+        self.shortest, self.left, self.whole = np.inf, np.inf, np.inf
+        #: Cells that are treated at once, and their slopes where strains count from, in short numbers: strains need no more.
         self._blocks = [slice(k, k + CELLS_AT_ONCE) for k in range(0, self._vertices.shape[1], CELLS_AT_ONCE)]
         of_mesh = [self._slopes(np.array(config.X.T), cells) for cells in self._blocks]
         steepest = max((_steepest(_inverse(of)) for of in of_mesh), default=0.0)
-        self._of_mesh = [of.astype(np.float32) for of in of_mesh]
+        self._since = [of.astype(np.float32) for of in of_mesh]
         self._least = COLLAPSED / float(reduced(problem.comm, steepest, op=MPI.MAX))
         self.sudden = False  # whether accelerations may have strained cells much in the last step
         self._inverse = np.where(self.moving, 1.0 / np.where(m > 0.0, m, 1.0), 0.0)
@@ -219,8 +219,8 @@ class ExplicitStepper:
             self.sudden = 2.0 * largest * dt**2 > CHECKED_STRAIN * self.shortest
             if self.sudden:
                 now, then = np.array(config.x.T), np.array((config.X + config.of(problem.committed)).T)
-                strain = _strain(_inverse(self._slopes(now)), self._slopes(then))
-                changed = float(reduced(problem.comm, strain, op=MPI.MAX)) > CHECKED_STRAIN
+                strain = float(_strains(_inverse(self._slopes(now)), self._slopes(then)).max(initial=0.0))
+                changed = reduced(problem.comm, strain, op=MPI.MAX) > CHECKED_STRAIN
         if not changed and self.pattern() == before:
             return
         critical = self.critical_step()
@@ -272,40 +272,40 @@ class ExplicitStepper:
         found = self._derivatives @ of.take(self._vertices[:, cells], axis=1)
         return np.asarray(found.reshape(len(of), self.problem.config.tdim, -1).transpose(1, 0, 2))
 
-    def look(self, stretch: float = np.inf) -> float:
-        """Find how fast the velocities strain cells, and their least height (collective).
+    def count_from(self, displacement: Array) -> None:
+        """Let strains count from this displacement on, ghosts included ``(n,)``: the critical step is known there."""
+        config, self.problem.step_control.known_at = self.problem.config, displacement
+        x = (config.X + config.of(displacement)).T
+        self._since = [self._slopes(x, cells).astype(np.float32) for cells in self._blocks]
 
-        Args:
-            stretch: strain of cells since the critical step was found, as far as known.
+    def look(self) -> None:
+        """Find when the velocities will have strained a cell as far as it may since ``count_from``, and the least height (collective).
 
-        Returns:
-            This strain, or that since the start if this is less than changes the critical step.
-
-        Raises:
-            InvertedElementError: if the height is a small part of the least one of the mesh.
+        InvertedElementError if the height is a small part of the least one of the mesh.
         """
         # rates per step are far from the ends of the range of short numbers, in any units
         dt, g, worst = self.problem.step_control.nominal, self.problem.config.gdim, np.zeros(3)
         both = np.concatenate([self.problem.config.x.T, dt * self._nodal(self.dynamics.velocity)])
-        for cells, of_mesh in zip(self._blocks, self._of_mesh):
+        for cells, since in zip(self._blocks, self._since):
             slopes = self._slopes(both, cells)
             inverse, rates = _inverse(slopes[:, :g]), slopes[:, g:].astype(np.float32)
             steepest, inverse = _steepest(inverse), inverse.astype(np.float32)
-            worst = np.maximum(worst, (_rates(inverse, rates).max(), steepest, _strain(inverse, of_mesh)))
-        rate, steepest, strain = map(float, reduced(self.problem.comm, worst, op=MPI.MAX))
-        self.rate, self.shortest = rate / dt, 1.0 / steepest
+            fast, strain = _rates(inverse, rates), _strains(inverse, since)
+            # infinite where the strain is reached
+            over = np.divide(fast, CHECKED_STRAIN - strain, out=np.full_like(fast, np.inf), where=strain < CHECKED_STRAIN)
+            worst = np.maximum(worst, (fast.max(initial=0.0), steepest, over.max(initial=0.0)))
+        fastest, steepest, soonest = map(float, reduced(self.problem.comm, worst, op=MPI.MAX))
+        self.shortest = 1.0 / steepest
+        self.whole, self.left = (dt / one if one > 0.0 else np.inf for one in (fastest / CHECKED_STRAIN, soonest))
         if self.shortest < self._least:
             raise InvertedElementError(
                 f"cells collapse: their least height, {self._least / COLLAPSED:.3g} at the start, is {self.shortest:.3g}; "
                 "take a finer mesh, or lower speeds"
             )
-        return strain if strain < CHECKED_STRAIN else stretch
 
-    def steps_to_look(self, dt: float, stretch: float) -> int:
-        """Number of steps of length ``dt`` until cells are strained as far as they may, of which ``stretch`` is done; 0 for none."""
-        strain = dt * self.rate
-        left = max(CHECKED_STRAIN - stretch, 0.0)
-        return int(min(left / strain, CHECKED_EVERY)) if strain > 0.0 else CHECKED_EVERY
+    def steps_to_look(self, dt: float, anew: bool = False) -> int:
+        """Number of steps of length ``dt`` until a cell is strained as far as it may, or that with strains counted ``anew``; 0 for none."""
+        return int(min((self.whole if anew else self.left) / dt, CHECKED_EVERY))
 
     def steady_step(self, critical: float) -> float:
         """Longest step in which no cell is strained further than it may, so that stiffnesses hardly change (collective).
@@ -348,11 +348,11 @@ def _steepest(inverse: AnyArray) -> float:
     return float(np.sqrt(np.square(inverse).sum(axis=0).max(initial=0.0)))
 
 
-def _strain(inverse: AnyArray, since: AnyArray) -> float:
-    """Largest of Almansi's strains, from the inverse ``_slopes`` of positions and the earlier ``_slopes``."""
+def _strains(inverse: AnyArray, since: AnyArray) -> AnyArray:
+    """Almansi's strains ``(n,)``, from the inverse ``_slopes`` of positions and the earlier ``_slopes``."""
     back = np.einsum("itn,tjn->ijn", inverse, since)
     E = 0.5 * (np.eye(len(back), dtype=back.dtype)[:, :, None] - np.einsum("ikn,jkn->ijn", back, back))
-    return float(np.sqrt(np.einsum("ijn,ijn->n", E, E).max(initial=0.0)))
+    return np.sqrt(np.einsum("ijn,ijn->n", E, E))
 
 
 def _rates(inverse: AnyArray, of: AnyArray) -> AnyArray:

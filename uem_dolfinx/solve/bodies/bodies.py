@@ -169,10 +169,12 @@ class Bodies:
         """The assembled residual at the owned nodes of the displacement ``(n_owned, gdim)``."""
         return np.asarray(self.config.rows(self._b.array_r)[: self.config.n_owned])
 
-    def forces_at_work(self, F: PETSc.Vec) -> Any:
-        """Reference for the size of residuals: the norm of forces, or one for each field ``(n_fields,)`` (collective)."""
-        norm = F.norm() if self._fields is None else np.maximum(self.unknowns.norms(F), self._fields.terms())
-        return self._with_masses(norm)
+    def forces_at_work(self, F: PETSc.Vec | None = None) -> Any:
+        """Reference for residuals: the norm of forces F, by default those assembled, or one for each field ``(n_fields,)`` (collective)."""
+        if self._fields is None:
+            # PETSc keeps the norm of a vector that has not changed
+            return self._with_masses((self._b if F is None else F).norm())
+        return self._with_masses(np.maximum(self.unknowns.norms(self.residual if F is None else F), self._fields.terms()))
 
     def _with_masses(self, norm: Any) -> Any:
         """A norm of forces, or one for each field ``(n_fields,)``, combined with those of masses at points."""
@@ -254,14 +256,16 @@ class Bodies:
             return self._with_masses(above)
         return self._fields.above(self.residual.array_r, ABOVE_ROUNDING * FORCE_ROUNDING) + self.of_fields(above)
 
-    def remembered(self, positioned: bool) -> Any:
-        """Norm relative to which forces of later steps may be rounding, with the terms of other fields (collective)."""
+    def remembered(self, positioned: bool, before: Any) -> Any:
+        """Norm, ``before`` at least, relative to which forces of later steps may be rounding, with terms of other fields (collective)."""
+        if self._fields is None and self._with_masses(self._b.norm()) <= before:
+            return before
         above = self.above_rounding(positioned)
         if self._fields is None:
             # laws of the deformation gradient round 1 + grad(u), however small u is; by how much is unknown before the first tangent
-            return above if self.linear or above > self.strain_rounding() > 0.0 else 0.0
+            return max(above, before) if self.linear or above > self.strain_rounding() > 0.0 else before
         terms, rounding = self._fields.terms(), np.maximum(FORCE_ROUNDING * self._fields.largest(), self.strain_rounding())
-        return np.maximum(above, np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
+        return np.maximum(np.maximum(above, before), np.where(terms > ABOVE_ROUNDING * rounding, terms, 0.0))
 
     def strain_rounding(self) -> Any:
         """Norm of the forces due to rounding of ``1 + grad(u)``, or one for each field ``(n_fields,)`` (collective)."""
@@ -332,6 +336,8 @@ class Bodies:
     def dirichlet_met(self) -> bool:
         """Whether the Dirichlet values are met (collective)."""
         there, field = self.u.x.array, self.unknowns.field_of if self.unknowns.mixed else None
+        if reduced(self.comm, not ((self.wanted != there) & self.held).any(), op=MPI.LAND):
+            return True
         parts = [self.held] if field is None else [self.held & (field == i) for i in range(self.unknowns.n_fields)]
         both = np.array([[np.abs(a).max(initial=0.0) for a in (self.wanted[h] - there[h], self.wanted[h])] for h in parts])
         self.comm.Allreduce(MPI.IN_PLACE, both, op=MPI.MAX)
@@ -391,7 +397,7 @@ class Bodies:
             material.commit()
         self.stiffness_at_start = self.stiffness
         explicit = self.dynamics is not None and self.dynamics.moving and self.dynamics.scheme.explicit
-        self.driving = np.array(self.residual.array_r) if explicit else None
+        self.driving = self.config.rows(self.residual_of_all).ravel() if explicit else None
 
     def restore(self) -> None:
         """Restore the committed state, after the displacement has been reset to the committed one."""

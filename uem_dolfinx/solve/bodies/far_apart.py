@@ -18,6 +18,7 @@ from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import contacts_with, slides
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.search import MeshTarget
+from uem_dolfinx.parallel import reduced
 
 #: Meshed surfaces whose boxes are farther from each other than this are far apart.
 #: [convention; the target's longest facet; test_far_apart.py::test_what_is_far_apart]
@@ -92,6 +93,9 @@ class FarApart:
         # contacts with active contactors, or contactors past an end, are searched
         for place, p in zip(self._places, self._wholes):
             more[1, place] = contacts_with(p, p.trial.active | p.trial.passed | p.trial.barred)
+        if not self.any and reduced(self._config.comm, more[1], op=MPI.MAX).all():
+            # none is left out, and none will be
+            return
         self._boxes, (offset, used) = self._look(self._config.x, more)
         self._near = self._reach + offset
         far = (used == 0.0) & (self._boxes.apart > self._near)

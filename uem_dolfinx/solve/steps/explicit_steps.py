@@ -223,10 +223,11 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     control.begin(length)
     stepper.look()
     if resumed:
+        stepper.count_from(control.known_at)
         stepper.shortest = control.shortest
     else:
         # bodies that touch deform from the first step on
-        control.due, control.stretch, control.shortest = control.number + 1, 0.0, stepper.shortest
+        control.due, control.shortest = control.number + 1, stepper.shortest
     while (remainder := end - dynamics.time) > LEFT * length:
         taken = min(length if remainder >= (1.0 - LEFT) * length else remainder, control.longest)
         try:
@@ -250,13 +251,13 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         due = not problem.bodies.linear and (number >= control.due or after != before or stepper.sudden)
         before, found = after, (pattern := stepper.pattern()) != last
         if due or found:
-            control.stretch, control.shortest = stepper.look(control.stretch), stepper.shortest
-        if end - dynamics.time > LEFT * length and (found or (due and not stepper.steps_to_look(length, control.stretch))):
-            length, control.stretch = _length(stepper, dt, end), 0.0
-            control.begin(length)
-        if due or found:
-            steps = max(stepper.steps_to_look(length, control.stretch), 1)
-            control.due, control.stretch = number + steps, control.stretch + steps * length * stepper.rate
+            stepper.look()
+            control.shortest = stepper.shortest
+            anew = end - dynamics.time > LEFT * length and (found or not stepper.steps_to_look(length))
+            if anew:
+                length = _length(stepper, dt, end)
+                control.begin(length)
+            control.due = number + max(stepper.steps_to_look(length, anew), 1)
         # a checkpoint holds what the next step begins with
         yield done
 
@@ -264,6 +265,7 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
 def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:
     """Length of steps that divide the time to the end; InputError for a given one that is too long (collective)."""
     critical, dynamics = stepper.critical_step(), stepper.dynamics
+    stepper.count_from(stepper.problem.committed)
     steady = stepper.steady_step(critical)
     if dt is not None:
         if dt > min(critical, steady):

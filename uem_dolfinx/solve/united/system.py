@@ -164,7 +164,8 @@ class BodySystem:
         F, known = self.bodies.residual, known_forces(self.near) if self.exchanges.frictional else []
         for nodes, forces in filter(None, [*known, *[pair.applied_forces() for pair in self.near]]):
             F.array[: self._n] -= self.config.add_at_owners(nodes, forces).ravel()
-        F.array[:] += sum([heat.residual() for heat in self._heats])
+        if self._heats:
+            F.array[:] += sum([heat.residual() for heat in self._heats])
         return F
 
     def assemble_constraints(self, in_equilibrium: InEquilibrium) -> IterationState:
@@ -184,12 +185,12 @@ class BodySystem:
         with timed("uniting equations"):
             rows, self._here = self.present_rows(), None
             residual = rows.test.reduce(y := rows.test.pass_on(F))
-            at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
+            at_rest = in_equilibrium(norm := self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             if at_rest or (turning and not pairs):
                 self._take(self._read_forces(rows, y))
                 if any(heat.lags for heat in self._heats):
                     residual = rows.test.transpose(F := self.residual())
-                    at_rest = in_equilibrium(self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
+                    at_rest = in_equilibrium(norm := self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             self._swept = not at_rest
             moved = bool(pairs) and reduced(self.comm, any([pair.follow() for pair in pairs]), op=MPI.LOR)
             found = [
@@ -201,12 +202,13 @@ class BodySystem:
             unsettled = moved or (violated > 0 and not (at_rest and self.floating.adrift))
             wanting = not (at_rest and violated == 0 and not moved)
             # the residual at the beginning of a step does not include prescribed increments
-            if wanting and pairs and self._led and self.exchanges.visit(first(self.unknowns.norms(residual))):
+            if wanting and pairs and self._led and self.exchanges.visit(first(norm)):
                 moved = True
             fallen = self.floating.fall_again(self.place, unsettled, at_rest)
             if moved or fallen:
                 rows = self._rows()
                 residual = rows.test.transpose(self.residual())
+                norm = self.unknowns.norms(residual)
         trial, added, held, active, gap = self._trial_of(rows)
         self.rows = rows
         torn = max([heat.torn() for heat in self._heats], default=0.0)
@@ -214,8 +216,8 @@ class BodySystem:
             trial=trial,
             test=rows.test,
             residual=residual,
-            norm=self.unknowns.norms(residual),
-            scale=self.bodies.forces_at_work(self.bodies.residual),
+            norm=norm,
+            scale=self.bodies.forces_at_work(),
             rounding=rounding,
             gap=gap,
             active=active,
@@ -267,7 +269,7 @@ class BodySystem:
         gaps = [one.largest_gap_here() for one in (*self.near, self.linear) if one is not None]
         united = sum([int(pair.united.sum()) for pair in self.near])
         each = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
-        return trial, *slip_terms(self.near, self.unknowns.vector(), self.linear, convex), int(each[:, 0].sum()), each[:, 1].max()
+        return trial, *slip_terms(self.near, self.unknowns.like, self.linear, convex), int(each[:, 0].sum()), each[:, 1].max()
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state with an active set changed where gaps and forces, both to first order, violate contact conditions (collective)."""
@@ -388,7 +390,7 @@ class BodySystem:
         if first or self.newton == "full":
             self.bodies.update_tangent()
         with timed("contact curvature"):
-            how = self.unknowns.vector(), self._petrov_galerkin, self.exchanges.convex, self.linear
+            how = self.unknowns.like, self._petrov_galerkin, self.exchanges.convex, self.linear
             self.curvature = curvature_of(self.near, *how) if self.consistent_tangent else None
         self.exchanges.begin()
         self._adrift = False
