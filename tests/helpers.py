@@ -189,7 +189,8 @@ def tangent_by_differences(problem: uem.UnitedProblem, contact: uem.Contact) -> 
     residual(smooth)
     facets = pair.kinematics.projection.facet.copy()
     A = problem.bodies.update_tangent().copy()
-    curvature = curvature_of(system.pairs, system.config.vector(), system._petrov_galerkin, False)
+    apart = system._petrov_galerkin or pair.target.averaged
+    curvature = curvature_of(system.pairs, system.config.vector(), apart, False)
     assert curvature is not None
     du = A.createVecRight()
     du.array[:] = direction[: problem.config.n_owned].ravel()

@@ -50,6 +50,15 @@ def sums_of_groups(values: Array, first: Ints, order: Ints | None = None) -> Arr
     return sums_of_rows(group, values.reshape(len(values), -1), len(first)).reshape(len(first), *values.shape[1:])
 
 
+def pairs_of_equals(numbers: Ints) -> tuple[Ints, Ints]:
+    """Pairs of indices of equal numbers ``(n,)``, including each index with itself ``(k,)``."""
+    order = np.argsort(numbers, kind="stable")
+    first, end = (np.searchsorted(numbers[order], numbers[order], side=side) for side in ("left", "right"))
+    count = end - first
+    j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - first, count)
+    return order[np.repeat(np.arange(len(numbers)), count)], order[j]
+
+
 def among(values: Ints, known: Ints) -> Bools:
     """Which of the values ``(m,)`` are ``known (k,)``, distinct and sorted: ``(m,)``; a faster ``numpy.isin``."""
     if not len(known):

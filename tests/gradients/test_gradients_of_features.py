@@ -102,7 +102,9 @@ EXACT = {
     "mortar, degree 2": {"degree": 2, "coupling": "mortar"},
     "sliding='fixed'": {"sliding": "fixed", "controls": ("E", "top", "offset")},
     "sliding='small', the first step": {"sliding": "small", "controls": ("E", "top", "offset")},
-    "averaged normals": {"normals": "averaged", "controls": ("E", "top")},
+    "averaged normals": {"normals": "averaged", "controls": ("E", "top", "X")},
+    "averaged normals, degree 2": {"normals": "averaged", "degree": 2, "controls": ("E", "top", "X")},
+    "averaged normals on hexahedra": {"normals": "averaged", "cell": "hexahedron", "controls": ("E", "top", "X")},
     "a plane": {"target": plane},
     "a plane with mortar": {"target": plane, "coupling": "mortar"},
     "a ball": {"target": ball},
@@ -123,6 +125,7 @@ def test_exact(what):
 REFUSED = {
     "friction": ({"friction": 0.3}, "E", "contact with friction depends on all steps"),
     "wear": ({"wear": 1e-3}, "E", "contact with friction depends on all steps"),
+    "a soft contact, averaged normals": ({"normal": uem.SoftContact(1e10), "normals": "averaged"}, "E", "normals='averaged'"),
     "chords": ({"chords": True, "degree": 2}, "E", "no gradient with chords=True"),
     "the shape, sliding='small'": ({"sliding": "small"}, "X", "needs contacts of sliding='finite'"),
     "the shape, adjusted gaps": ({"adjust": 0.01}, "X", "no adjust"),

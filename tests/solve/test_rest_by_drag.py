@@ -59,6 +59,20 @@ def test_a_block_rests_in_a_polygonal_bowl(cell, degree, n_low, how):
     assert COMM.allreduce(float(np.abs(problem.u.x.array - before).max(initial=0.0)), op=MPI.MAX) < 1e-6
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_block_rests_with_averaged_normals(degree):
+    """From starts that differ by rounding, in metres and kilometres, a few iterations without drag lead to one place."""
+    found = []
+    for more, size in ((0.0, 1.0), (7e-9, 1.0), (0.0, 1e3)):
+        problem, contact = in_bowl("quadrilateral", degree, 4, 0.1 + more, size, normals="averaged")
+        (step,) = uem.load_steps(problem, 1)
+        force = contact.resultant().force / size
+        assert step.cuts == 0 and step.newton_iterations <= 8 and force == pytest.approx([0.0, LOAD], abs=1e-8 * LOAD)
+        found.append(centre(problem, contact, size))
+    assert found[1] == pytest.approx(found[0], abs=1e-6) and found[2] == pytest.approx(found[0], abs=1e-6)
+
+
 @pytest.mark.parametrize("cell, degree", [("quadrilateral", 1), ("triangle", 2)])
 def test_the_rest_does_not_depend_on_the_fall_or_the_size(cell, degree):
     """Blocks that fall from two heights, and a thousand times as large, come to one place in the bowl's corners."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, gathered_matrix, modulus, run, scene, st_venant, tangent_by_differences
+from helpers import at, blocks, box, clamp, gathered_matrix, modulus, run, scene, slow, st_venant, tangent_by_differences
 
 import uem_dolfinx as uem
 from uem_dolfinx import compat, forms
@@ -161,8 +161,8 @@ def contact_scene(cell, target="mesh", **options):
     )
     slide = [0.2, -0.25] if b.gdim == 2 else [0.2, 0.0, -0.25]
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=slide)]
-    other = b.low if target == "mesh" else uem.RigidSphere([0.4] * (b.gdim - 1) + [-1.0], 1.05)
-    contact = uem.Contact(b.high, other, max_penetration=1.0)
+    other = uem.RigidSphere([0.4] * (b.gdim - 1) + [-1.0], 1.05) if target == "rigid" else b.low
+    contact = uem.Contact(b.high, other, max_penetration=1.0, normals="averaged" if target == "averaged" else "facet")
     problem = uem.UnitedProblem(
         st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact], petsc_options_prefix="tangent_", **options
     )
@@ -170,8 +170,12 @@ def contact_scene(cell, target="mesh", **options):
 
 
 @pytest.mark.parametrize(
-    "cell,target", [("triangle", "mesh"), ("quadrilateral", "rigid"), ("tetrahedron", "mesh"), ("hexahedron", "mesh")]
-)
+    "cell,target",
+    [
+        ("triangle", "mesh"), ("quadrilateral", "rigid"), ("tetrahedron", "mesh"), ("hexahedron", "mesh"), ("triangle", "averaged"),
+        ("tetrahedron", "averaged"), ("hexahedron", "averaged"),
+    ],
+)  # fmt: skip
 def test_united_tangent_is_the_derivative_of_the_residual(cell, target):
     """``K - sum lambda grad^2 g`` against differences of ``F - sum lambda grad g`` with the contact forces lambda held."""
     _, contact, problem = contact_scene(cell, target)
@@ -193,12 +197,14 @@ def orders(history):
     return found
 
 
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_order_of_convergence(cell):
+@pytest.mark.parametrize(
+    "cell, target", [("triangle", "mesh"), ("hexahedron", "mesh"), ("triangle", "averaged"), slow("hexahedron", "averaged")]
+)
+def test_order_of_convergence(cell, target):
     """Quadratic with the curvature of the contact, linear without, and the same answer."""
     results = {}
     for consistent in (True, False):
-        b, contact, problem = contact_scene(cell, consistent_tangent=consistent, rtol=1e-11, max_iterations=80)
+        b, contact, problem = contact_scene(cell, target, consistent_tangent=consistent, rtol=1e-11, max_iterations=80)
         history = [step.iterations for step in run(problem, 2)]
         results[consistent] = [orders(h) for h in history], sum(len(h) - 1 for h in history), contact.resultant().force
     assert max(max(o, default=0.0) for o in results[True][0]) >= 1.8

@@ -216,7 +216,7 @@ class Condensed(Returning):
 
     def take(self, solved: Solved, P: Restriction, Q: Restriction, K: PETSc.Mat, G: PETSc.Mat | None) -> None:
         """Use a known solution of the constrained problem (collective)."""
-        self.made_of, self._dense, self._taken = (P, Q, K, G), None, P.reduce(solved.du - P.c)
+        self.made_of, self._dense, self._taken = (P, Q, K, G), None, P.unknowns(solved.du - P.c)
         self.negative, self.indefinite, self.left, self.whole = solved.negative, solved.indefinite, solved.left, True
 
     def begin_at(self, c: PETSc.Vec | None, rounding: float = 0.0) -> None:

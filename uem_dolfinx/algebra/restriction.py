@@ -74,6 +74,7 @@ class Restriction:
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift, error = self._eliminate() if like is None else self._eliminate_like(like)
+        self._orthonormal = self if like is None else like  # restriction with the same unknowns, in orthonormal frames
         terms = equations.active[equations.row].sum()
         sums = np.array([equations.active.sum(), len(equations), terms, error is not None], dtype=np.int64)
         self.n_equations, self._n_rows, self._n_terms, wrong = reduced(self.comm, sums).tolist()
@@ -345,6 +346,10 @@ class Restriction:
         q = self._free_part(full)
         q[self.nodes] = np.einsum("kij,ki->kj", self.frames, full[self.nodes])
         return self.space.vector(q)
+
+    def unknowns(self, du: PETSc.Vec) -> PETSc.Vec:
+        """The unknowns q of an increment ``P q``."""
+        return self._orthonormal.reduce(du)
 
     def transpose(self, F: PETSc.Vec) -> PETSc.Vec:
         """``P'F``."""

@@ -14,12 +14,12 @@ from mpi4py import MPI
 
 import numpy as np
 
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, pairs_of_equals
 from uem_dolfinx.geometry.candidates import balls_that_meet
 from uem_dolfinx.geometry.edge_gaps import EdgeGaps, cubics, may_cross
 from uem_dolfinx.geometry.facets import TargetFacets
 from uem_dolfinx.geometry.nodes import Halo
-from uem_dolfinx.geometry.sharp import SHARP_EDGE, pairs_of_equals, sharp_edges
+from uem_dolfinx.geometry.sharp import SHARP_EDGE, sharp_edges
 from uem_dolfinx.log import timed_as
 from uem_dolfinx.parallel import Exchange, gathered, reduced, sums_by_keys
 

@@ -13,10 +13,10 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, sums_of_rows
+from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, pairs_of_equals, sums_of_rows
 from uem_dolfinx.errors import OrientationError
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, nodal_area_vectors, unit_normals
+from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, nodal_area_slopes, nodal_area_vectors, unit_normals
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered, reduced
 
@@ -169,6 +169,47 @@ class TargetFacets:
         nodal[:] = sums_of_rows(dofs.ravel(), vectors.reshape(-1, self.config.gdim), len(nodal))
         forms.sum_ghosts(field)
         return np.asarray(nodal[dofs])
+
+    def turning(self, facet: Ints) -> tuple[Ints, Array]:
+        """Derivatives of the averaged normals at the nodes of facets ``facet (k,)``, numbered over all ranks (collective).
+
+        Returns:
+            Global nodes of the facets around each node, -1 for none ``(k, nn, p, nn)``, and derivatives by their positions
+            ``(k, nn, p, nn, gdim, gdim)``.
+        """
+        exchange, i, j, place = self._meeting
+        x, (m, nn), g = self.x, self.nodes.shape, self.config.gdim
+        slopes = self.sign[:, None, None, None, None] * nodal_area_slopes(self.shape, x)
+        nodes, vectors, slopes = exchange.send(
+            np.repeat(self.nodes, nn, axis=0), self._area_vectors(x).reshape(m * nn, g), slopes.reshape(m * nn, nn, g, g)
+        )
+        sums = sums_of_rows(i, vectors[j], len(vectors))
+        length, normal = np.linalg.norm(sums, axis=1), unit(sums)
+        across = (np.eye(g) - normal[:, :, None] * normal[:, None]) / np.where(length > 0, length, np.inf)[:, None, None]
+        most = int(reduced(self.config.comm, int(place.max(initial=0)), op=MPI.MAX)) + 1
+        around, turned = np.full((len(sums), most, nn), -1), np.zeros((len(sums), most, nn, g, g))
+        around[i, place], turned[i, place] = nodes[j], np.einsum("kgh,kahi->kagi", across[i], slopes[j])
+        found = np.empty((m * nn, most, nn), np.int64), np.empty((m * nn, most, nn, g, g))
+        found[0][exchange.rows], found[1][exchange.rows] = exchange.back(around, turned)
+        around, turned = (of_all.reshape(m, nn, *of_all.shape[1:]) for of_all in found)
+        return self.values_at(facet, around), self.values_at(facet, turned)
+
+    @cached_property
+    def _meeting(self) -> tuple[Exchange, Ints, Ints, Ints]:
+        """Exchange of the nodes of facets with their owners, and pairs of received ones that have one normal (first time: collective).
+
+        The third array is the place of each pair among those of its first node.
+        """
+        exchange = Exchange.to(self.config.comm, self.config.owner_of(self.nodes.ravel()))
+        i, j = self._of_one_normal(exchange)
+        order = np.argsort(i, kind="stable")
+        i, j = i[order], j[order]
+        return exchange, i, j, np.arange(len(i)) - np.searchsorted(i, i)
+
+    def _of_one_normal(self, exchange: Exchange) -> tuple[Ints, Ints]:
+        """Pairs of received nodes of facets whose area vectors are summed (collective)."""
+        (there,) = exchange.send(self.nodes.ravel())
+        return pairs_of_equals(there)
 
     def spread(self) -> Array:
         """Sum of the areas around each node over the length of the sum of area vectors: 1 if flat ``(m, nn)`` (collective)."""

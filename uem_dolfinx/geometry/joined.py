@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import forms
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, pairs_of_equals, sums_of_rows
 from uem_dolfinx.geometry.candidates import EQUALLY_NEAR, RankBoxes, candidate_pairs
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of
@@ -74,6 +74,11 @@ class JoinedFacets(TargetFacets):
             forms.sum_ghosts(field)
             found[own] = nodal[dofs]
         return found
+
+    def _of_one_normal(self, exchange: Exchange) -> tuple[Ints, Ints]:
+        """See ``TargetFacets``; of one surface (collective)."""
+        there, surface = exchange.send(self.nodes.ravel(), np.repeat(self.surface, self.nodes.shape[1]))
+        return pairs_of_equals(there * self._begin.shape[1] + surface)
 
     def spread(self) -> Array:
         """See ``TargetFacets``; for facets of one surface (collective)."""

@@ -186,6 +186,19 @@ def nodal_area_vectors(shape: FacetShape, x: Array) -> Array:
     return _across(np.einsum("kaf,nag->nkfg", shape.nodal.dN, x))
 
 
+def nodal_area_slopes(shape: FacetShape, x: Array) -> Array:
+    """Derivatives of ``nodal_area_vectors`` by the positions of the facets' nodes ``(n, nn, nn, gdim, gdim)``."""
+    dN = shape.nodal.dN
+    if shape.dim == 1:
+        quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
+        return np.broadcast_to(np.einsum("kaf,gh->kagh", dN, quarter), (len(x), *dN.shape[:2], 2, 2))
+    t = np.einsum("kaf,nag->nkfg", dN, x)
+    across = np.swapaxes(np.cross(t[..., None, :], np.eye(3)), -1, -2)
+    return np.asarray(
+        np.einsum("ka,nkgh->nkagh", dN[..., 1], across[:, :, 0]) - np.einsum("ka,nkgh->nkagh", dN[..., 0], across[:, :, 1])
+    )
+
+
 def integrals(shape: FacetShape, x: Array, axisymmetric: bool = False) -> Array:
     """Integrals of the shape functions over facets ``x (n, nn, gdim)``, in axisymmetry over whole circles: ``(n, nn)``."""
     points, weights = quadrature_rule(shape.cell, 2 * shape.degree + 1)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from uem_dolfinx.arrays import Bools, Ints
+from uem_dolfinx.arrays import Bools, Ints, pairs_of_equals
 from uem_dolfinx.parallel import Exchange, sums_by_keys
 
 if TYPE_CHECKING:
@@ -64,12 +64,3 @@ def sharp_nodes(facets: TargetFacets, cosine: float = SHARP_EDGE, convex: bool =
 def to_mean(cosine: float) -> float:
     """Cosine of half the angle with this cosine, which is the angle between a facet normal and the mean of two."""
     return float(np.sqrt(0.5 * (1.0 + cosine)))
-
-
-def pairs_of_equals(numbers: Ints) -> tuple[Ints, Ints]:
-    """Pairs of indices of equal numbers ``(n,)``, including each index with itself ``(k,)``."""
-    order = np.argsort(numbers, kind="stable")
-    first, end = (np.searchsorted(numbers[order], numbers[order], side=side) for side in ("left", "right"))
-    count = end - first
-    j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - first, count)
-    return order[np.repeat(np.arange(len(numbers)), count)], order[j]

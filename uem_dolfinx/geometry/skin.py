@@ -10,12 +10,12 @@ from mpi4py import MPI
 import numpy as np
 
 from uem_dolfinx import compat, forms
-from uem_dolfinx.arrays import Array, Bools, Indices, Ints, sums_of_rows
+from uem_dolfinx.arrays import Array, Bools, Indices, Ints, pairs_of_equals, sums_of_rows
 from uem_dolfinx.errors import SurfaceError
 from uem_dolfinx.geometry.bodies import connected, find_bodies
 from uem_dolfinx.geometry.configuration import Configuration
 from uem_dolfinx.geometry.facets import FacetData, TargetFacets, spread_of, unit
-from uem_dolfinx.geometry.sharp import SHARP_EDGE, pairs_of_equals, sharp_edges
+from uem_dolfinx.geometry.sharp import SHARP_EDGE, sharp_edges
 from uem_dolfinx.geometry.surfaces import Areas, surface_nodes
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, reduced
@@ -138,6 +138,14 @@ class Skin(TargetFacets):
         (arrived,) = exchange.send(vectors[facet, node])
         (sums,) = exchange.back(sums_of_rows(i, arrived[j], len(arrived)))
         return (facet[exchange.rows], node[exchange.rows]), sums
+
+    def _of_one_normal(self, exchange: Exchange) -> tuple[Ints, Ints]:
+        """See ``TargetFacets``; at sharp edges of one face (collective)."""
+        reference = unit(self._area_vectors(self.config.X[self.dofs])).reshape(-1, self.config.gdim)
+        there, sharp, normal = exchange.send(self.nodes.ravel(), self.on_sides(self.edges.sharp)[self.dofs].ravel(), reference)
+        i, j = pairs_of_equals(there)
+        together = ~sharp[i] | (np.einsum("kg,kg->k", normal[i], normal[j]) > SHARP_EDGE)
+        return i[together], j[together]
 
     def _placed_at(self, x: Array) -> FacetData:
         """See ``TargetFacets``; at sharp edges, normals are averaged only over facets of one face (collective)."""

@@ -50,11 +50,6 @@ class ForwardStep(LinearisedStep):
         """Set the matrix ``Q'(K + G)P`` (collective)."""
         self.problem.solver.set_operator(self.P, self.K, self.G, None if self.Q is self.P else self.Q)
 
-    def solve(self, forces: PETSc.Vec) -> PETSc.Vec:
-        """``P dq`` with ``Q'(K + G)P dq = Q' forces`` (collective)."""
-        dq, _ = self.problem.solver.solve(self.Q.transpose(forces))
-        return self.P.expand(self.problem.solver.complete(dq))
-
     def moved(
         self, direction: Sequence[tuple[AnyControl, Any]], gaps: Array | float = 0.0, pushed: Array | float = 0.0
     ) -> Motion:

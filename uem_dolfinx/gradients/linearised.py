@@ -91,6 +91,7 @@ class Linearised:
         F: the residual in UFL.
         derivatives: of F and of functionals.
         P: restriction matrix of the active contactors.
+        Q: that of their forces; P, unless friction or averaged normals distinguish them.
         rows: their equations; ``equations`` lists the equations of each of the problem's ``interfaces``.
         multipliers: of all equations of contacts, and of users ``(m,)``.
         slopes: derivatives by the anchors of each interface, in a recorded step.
@@ -98,6 +99,7 @@ class Linearised:
     """
 
     P: Restriction
+    Q: Restriction
     rows: Rows
     multipliers: Array
     slopes: Sequence[AnchorSlopes | MeanSlopes | None] = ()
@@ -133,8 +135,8 @@ class Linearised:
         self.K, self.G = self.problem.bodies.tangent.K, together(system.curvature, state.added)
         self._K_back = self.K if is_symmetric(self.K, self.config.unknowns) else transposed(self.K)
         turning = [] if self.problem.linear is None else self.problem.linear.curvature()
-        skew = reduced(self.config.comm, int(any(is_skew(blocks) for _, blocks in turning)))
-        self._G_back = transposed(self.G) if skew else self.G
+        skew = reduced(self.config.comm, int(self.P is not self.Q or any(is_skew(blocks) for _, blocks in turning)))
+        self._G_back = transposed(self.G) if skew and self.G is not None else self.G
         self._tell_idle()
 
     def _state(self) -> BodyState:
@@ -146,7 +148,12 @@ class Linearised:
         bodies.assemble()
         state = system.assemble_constraints(lambda norm, scale, rounding: True)
         assert isinstance(state, BodyState)
-        self.P, self.rows, self.equations = state.trial, state.rows, state.rows.of(self.problem.interfaces)
+        self.P, self.Q, self.rows, self.equations = state.trial, state.test, state.rows, state.rows.of(self.problem.interfaces)
+        if self.rows.whole.moved is not None and self.P is self.rows.frictionless:
+            raise InputError(
+                "contactors with averaged normals are held by several equations, whose derivatives are not known: expected "
+                "normals='facet', or nodes that are contactors of one contact, with free normals"
+            )
         for contact in self.problem.contacts:
             refuse_sharp(contact)
         self.multipliers = state.test.multipliers(state.test.pass_on(system.residual()))
@@ -206,7 +213,7 @@ class Linearised:
         w = np.zeros(len(self.multipliers))
         for contact, own in weights.items():
             w[self.equations_of(contact)[1]] += own
-        return self.P.read_back(w)
+        return self.Q.read_back(w)
 
     def vector(self, at_nodes: npt.ArrayLike = 0.0) -> PETSc.Vec:
         """A vector with values at the displacement's owned nodes ``(n_owned, gdim)``, zero in other fields."""
@@ -220,10 +227,10 @@ class Linearised:
         return np.asarray(self.config.rows(values).ravel())
 
     def solve(self, forces: PETSc.Vec) -> PETSc.Vec:
-        """``P dq`` under forces, P being Q without friction (collective)."""
+        """``P dq`` with ``Q'(K + G)P dq = Q' forces`` (collective)."""
         # as accurately as an iterative solver can
-        dq, _ = self.problem.solver.solve(self.P.transpose(forces))
-        return self.P.expand(dq)
+        dq, _ = self.problem.solver.solve(self.Q.transpose(forces))
+        return self.P.expand(self.problem.solver.complete(dq))
 
     def held(self, v: PETSc.Vec) -> PETSc.Vec:
         """A vector without open rigid motions of bodies that only contact holds; a symmetric projection (collective)."""
@@ -242,11 +249,16 @@ class Linearised:
         turned = [part for _, state, own in acts if own for part in own.turned(state)]
         return together(together(curvature, gaps), contact_curvature(turned, like) if turned else None)
 
+    def set_operator(self) -> None:
+        """Set the matrix ``P'(K + G)'Q`` of the adjoint problem (collective)."""
+        self.problem.solver.set_operator(self.Q, self._K_back, self._G_back, None if self.Q is self.P else self.P)
+
     def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
-        """``a = Q mu`` of the adjoint problem under forces (collective)."""
-        if self._K_back is not self.K or self._G_back is not self.G:
-            self.problem.solver.set_operator(self.P, self._K_back, self._G_back)
-        return self.solve(forces)
+        """``Q mu`` with ``P'(K + G)'Q mu = P' forces`` (collective)."""
+        if self._K_back is not self.K or self._G_back is not self.G or self.P is not self.Q:
+            self.set_operator()
+        mu, _ = self.problem.solver.solve(self.P.transpose(forces))
+        return self.Q.expand(self.problem.solver.complete(mu))
 
     def adjoint(self, drive: PETSc.Vec) -> tuple[PETSc.Vec, PETSc.Vec]:
         """``a = Q mu`` under a load of the adjoint problem, and the residual that it leaves (collective)."""
@@ -403,7 +415,7 @@ class Linearised:
     def pressed(self, contact: Contact, motion: Motion) -> fem.Function:
         """Change of a contact's pressure with a motion (collective)."""
         slopes, (_, which) = self.pressures(contact), self.equations_of(contact)
-        multipliers = self.P.multipliers(self.P.pass_on(motion.reactions))
+        multipliers = self.Q.multipliers(self.Q.pass_on(motion.reactions))
         found = fem.Function(contact.pressure.function_space)
         found.x.array[contact.nodes] = slopes.along(multipliers[which], motion.du, motion.shape)
         found.x.scatter_forward()

@@ -236,6 +236,11 @@ def refuse_soft(contact: Contact) -> None:
         return
     for there, what, expected in (
         (contact.normal.damping, "damping", "no damping"),
+        (
+            contact.normals == "averaged" and contact.sliding == "finite",
+            "normals='averaged', sliding='finite'",
+            "normals='facet'",
+        ),
         (contact.measure == "current", "measure='current', whose areas change", "measure='reference'"),
         (
             contact.coupling == "mortar" and contact.sliding == "finite" and contact.config.degree == 2,

@@ -265,7 +265,7 @@ class LinearisedStep(Linearised):
                 "others, through which histories have no derivatives; let nodes be contactors of one contact, with free normals"
             )
         forms.free_petsc_garbage(problem.comm)
-        self.Q, self.K, self.G = state.test, problem.bodies.update_tangent(), self.stiffness_of()
+        self.K, self.G = problem.bodies.update_tangent(), self.stiffness_of()
         if problem.linear is not None and (parts := [*problem.linear.curvature(), *problem.linear.stiffness()]):
             self.G = together(self.G, contact_curvature(parts, self.config.unknowns.vector()))
         K = self.K
@@ -274,19 +274,10 @@ class LinearisedStep(Linearised):
         self.set_operator()
         self._tell_idle()
 
-    def set_operator(self) -> None:
-        """Set the matrix ``P'(K + G)'Q`` of the adjoint problem (collective)."""
-        self.problem.solver.set_operator(self.Q, self._K_back, self._G_back, None if self.Q is self.P else self.P)
-
     def __exit__(self, *error: object) -> None:
         solver = self.problem.solver
         if solver.iterative or not solver.lasting or any(self.slopes):
             self.problem.system.forget()
-
-    def solve_back(self, forces: PETSc.Vec) -> PETSc.Vec:
-        """``Q mu`` with ``P'(K + G)'Q mu = P' forces`` (collective)."""
-        mu, _ = self.problem.solver.solve(self.P.transpose(forces))
-        return self.Q.expand(self.problem.solver.complete(mu))
 
     def stiffness_back(self, a: PETSc.Vec) -> PETSc.Vec:
         """``(K + G)' a`` (collective)."""

@@ -49,10 +49,13 @@ class Family:
     weight: Array  # weight of each term ``(k,)``
     of_facet: Bools  # whether the child is the middle of a facet and the parent the middle of an edge ``(k,)``
 
-    def control_gaps(self, projection: Projection, usable: Bools) -> ControlGaps:
-        """Terms for this projection, with gaps of ``usable (n,)`` contactors, above the target and in no corner (collective)."""
+    def control_gaps(self, projection: Projection, closing: Array, usable: Bools) -> ControlGaps:
+        """Terms for this projection, with gaps of ``usable (n,)`` contactors, above the target and in no corner (collective).
+
+        ``closing (n, gdim)`` are derivatives of the nodes' gaps by their positions.
+        """
         p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
-        rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights])
+        rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights, closing])
         seen = self.config.from_owners(self.nodes, rows, self.parent)
         gap, normal, i = seen[:, 0], seen[:, 2 : 2 + g], self.child
         length = np.linalg.norm(self.config.X[self.nodes[i]] - self.config.X[self.parent], axis=1)
@@ -61,8 +64,8 @@ class Family:
         smooth &= usable[i] & (seen[:, 1] > 0)
         alone = np.zeros(len(self.nodes), dtype=bool)
         alone[i[~smooth]] = True
-        targets, weights = seen[:, 2 + g : 2 + g + nn].astype(np.int64), seen[:, 2 + g + nn :]
-        return ControlGaps(self, ~alone[i], gap, normal, targets, weights)
+        targets, weights, closing = np.split(seen[:, 2 + g :], [nn, 2 * nn], axis=1)
+        return ControlGaps(self, ~alone[i], gap, normal, targets.astype(np.int64), weights, closing)
 
     def sums(self, terms: Bools) -> Sums:
         """Matrix of sums of weight times child at the parents, for some of the terms ``(k,)``."""
@@ -86,6 +89,7 @@ class ControlGaps:
     normal: Array  # of the parents ``(k, gdim)``
     targets: Ints  # global nodes that the parents follow ``(k, nn)``
     weights: Array  # their weights ``(k, nn)``
+    closing: Array  # derivatives of the parents' gaps by their positions ``(k, gdim)``
 
     def of(self, gap: Array) -> Array:
         """Control gaps from nodal gaps ``(n,)``."""
@@ -102,10 +106,10 @@ class ControlGaps:
         """Basis of the control forces."""
         return self.family.basis(self.shared)
 
-    def extend(self, equations: UnitingEquations) -> UnitingEquations:
-        """Add the terms of the parents to the equations of all contactors."""
+    def extend(self, equations: UnitingEquations, normal: Array) -> UnitingEquations:
+        """Add the terms of the parents, along ``normal (k, gdim)``, to the equations of all contactors."""
         f, k = self.family, np.flatnonzero(self.shared)
-        own = f.weight[k, None] * self.normal[k]
+        own = f.weight[k, None] * normal[k]
         a, b = np.nonzero(self.targets[k] >= 0)
         row = f.child[k]
         return replace(
@@ -134,7 +138,7 @@ class Bernstein(NodeToSurface):
         """The kinematics with control gaps (collective)."""
         k, gap = kinematics, kinematics.projection.gap
         usable = ~k.ends.past(state) & ~state.in_corner
-        control = self.family.control_gaps(k.projection, usable)
+        control = self.family.control_gaps(k.projection, k.closing, usable)
         plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.out)
         return ControlKinematics(*plain, control=control)
 
@@ -162,8 +166,9 @@ class ControlKinematics(NodalKinematics):
         """Bernstein basis functions over the functions of the scaled gaps."""
         return np.asarray(self.control.basis.scale)
 
-    def _normal_rows(self, weights: Array) -> UnitingEquations:
-        return self.control.extend(super()._normal_rows(weights))
+    def _normal_rows(self, normal: Array, weights: Array) -> UnitingEquations:
+        c = self.control
+        return c.extend(super()._normal_rows(normal, weights), c.normal if normal is self.projection.normal else c.closing)
 
     def _nodal(self, state: PairState, multipliers: Array) -> tuple[Array, Array]:
         return self.control.forces(multipliers, state.active)

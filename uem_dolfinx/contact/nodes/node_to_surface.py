@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from mpi4py import MPI
 
@@ -234,12 +234,12 @@ class NodalKinematics(PlacedOnTarget):
     def gap_rows(self) -> GapRows:
         """One row along the normal for each contactor, followed by rows along further axes of corners."""
         p, c, of = self.projection, self.corners, self.of
-        found = GapRows.along_normals(of.config, self._normal_rows(p.weights), np.ones(len(self.points)), of.free)
-        if of.chords:
-            weights = np.array(of.target.chords(p))
+        found = GapRows.along_normals(of.config, self._normal_rows(p.normal, p.weights), np.ones(len(self.points)), of.free)
+        if of.chords or self.leans:
+            weights = np.array(of.target.chords(p)) if of.chords else p.weights
             if c is not None:
                 weights[c.which] = p.weights[c.which]
-            found = replace(found, moved=self._normal_rows(weights))
+            found = replace(found, moved=self._normal_rows(self.closing, weights))
         if c is None:
             return found
         gaps, more, contactors, kinds = c.gaps(self.points[c.which]), [], [found.contactor], [found.kind]
@@ -257,10 +257,24 @@ class NodalKinematics(PlacedOnTarget):
         assert equations is not None
         return GapRows(of.config, equations, found.scale, of.free, np.concatenate(contactors), np.concatenate(kinds), moved)
 
-    def _normal_rows(self, weights: Array) -> UnitingEquations:
-        """Normal equations of all contactors, with these weights of the target's nodes ``(n, nn)``."""
+    @property
+    def leans(self) -> bool:
+        """Whether forces act along averaged normals, and gaps close along those of the facets."""
+        return self.of.target.averaged and self.of.sliding == "finite"
+
+    @cached_property
+    def closing(self) -> Array:
+        """Derivatives of the nodes' gaps by their positions ``(n, gdim)``."""
+        if not self.leans:
+            return self.projection.normal
+        from uem_dolfinx.contact.nodes.averaged import closing
+
+        return closing(cast("MeshTarget", self.of.target), cast("FacetProjection", self.projection), self.of.free)
+
+    def _normal_rows(self, normal: Array, weights: Array) -> UnitingEquations:
+        """Equations of all contactors along ``normal (n, gdim)``, with these weights of the target's nodes ``(n, nn)``."""
         p, none = self.projection, np.zeros(len(self.points), bool)
-        return UnitingEquations.along(self.of.nodes, p.normal, p.nodes, weights, self.gap, none)
+        return UnitingEquations.along(self.of.nodes, normal, p.nodes, weights, self.gap, none)
 
     def forces(
         self, state: PairState, rows: ContactRows, multipliers: Array, friction: Callable[[Array], Array] | None = None
@@ -297,6 +311,15 @@ class NodalKinematics(PlacedOnTarget):
     def curvature(self, state: PairState, along: Along | None = None) -> list[tuple[Ints, Array]]:
         """Derivatives of the rows of contactors with force; contactors in corners remain on the edge, and their friction does not turn."""
         p, c, nodes = self.projection, self.corners, self.of.nodes
+        if self.leans:
+            from uem_dolfinx.contact.nodes.averaged import turning
+
+            tau = np.zeros(self.points.shape)
+            if along is not None:
+                tau[along.which] = along.tau
+            i = ((((state.lam > 0) | ~state.active) & (state.nodal != 0)) | tau.any(axis=1)).nonzero()[0]
+            found = cast("FacetProjection", p).take(i)
+            return turning(cast("MeshTarget", self.of.target), self.of.config.to_global(nodes[i]), found, state.nodal[i], tau[i])
         i = (((state.lam > 0) | ~state.active) & (state.nodal != 0) & ~state.in_corner).nonzero()[0]
         own, followed, blocks = nodes[i], p.nodes[i], -state.nodal[i, None, None] * p.hessians(i)
         if c is not None:

@@ -58,7 +58,7 @@ class ContactRows:
     #: ``NORMAL``, or the number of a corner's further axis; ``-1 - c`` for component c of a permanent equation ``(m,)``.
     kind: Ints
     tangent: Ints  # number of the direction along the target, -1 for all other rows ``(m,)``
-    moved: UnitingEquations | None = None  # rows of P if their weights differ; None if P has the same rows
+    moved: UnitingEquations | None = None  # rows of P if their weights or directions differ; None if P has the same rows
     #: what friction adds to the rows of slipping contactors in Q, zero for all others; None if no rank has any.
     tilt: UnitingEquations | None = None
     #: rows of relative motions that contact and friction resist ``(m,)``; None without friction, for the active ones.
@@ -113,13 +113,17 @@ class ContactRows:
 
     @property
     def resisting(self) -> UnitingEquations:
-        """Rows of P for all relative motions that contact and friction resist."""
-        return self.P if self.resisted is None else replace(self.P, active=self.resisted)
+        """Rows for all relative motions that contact and friction resist."""
+        return self.rows if self.resisted is None else replace(self.rows, active=self.resisted)
 
     @property
     def stopping(self) -> UnitingEquations:
-        """Rows that restrain rigid-body motions; those of P come last."""
-        return self.P if self.crosswise is None else UnitingEquations.join([self.crosswise, self.P], self.P.direction.shape[1])
+        """Rows that restrain rigid-body motions, those of gaps last."""
+        return (
+            self.rows
+            if self.crosswise is None
+            else UnitingEquations.join([self.crosswise, self.rows], self.rows.direction.shape[1])
+        )
 
     @cached_property
     def normal(self) -> Bools:
@@ -154,7 +158,7 @@ class GapRows:
     free: Bools  # components of the contactors without Dirichlet condition ``(n, gdim)``
     contactor: Ints  # of each row ``(m,)``
     kind: Ints  # ``NORMAL``, or the number of a corner's further axis ``(m,)``
-    #: rows of P if their weights differ from the weights of the gaps; None if they are equal.
+    #: rows of P if they are others, with weights of chords or along the facets' normals; None if they are equal.
     moved: UnitingEquations | None = None
 
     @classmethod
@@ -168,16 +172,16 @@ class GapRows:
         """The followed nodes (first time: collective)."""
         return Halo(self.config, self.equations.followed)
 
-    def along(self, values: Array) -> Array:
-        """Left sides of the equations along the normals for ``values (n_owned, gdim)`` of the owned nodes: ``(n,)`` (collective)."""
-        eq, n = self.equations, len(self.scale)
+    def along(self, values: Array, rows: UnitingEquations | None = None) -> Array:
+        """Left sides of the equations, or of other ``rows``, for ``values (n_owned, gdim)`` of the owned nodes: ``(n,)`` (collective)."""
+        eq, n = rows or self.equations, len(self.scale)
         theirs = np.einsum("kg,kg->k", eq.coefficients, self._halo.take(values.__getitem__))
         own = np.einsum("ng,ng->n", eq.direction[:n], values[eq.node[:n]])
         return np.asarray(own - np.bincount(eq.row, theirs, minlength=len(eq))[:n])
 
     def gaps(self, du: Array) -> Array:
         """Deciding gaps ``(n,)`` after an increment of the owned nodes ``(n_owned, gdim)``, to first order (collective)."""
-        return np.asarray(self.scale * (self.equations.gap[: len(self.scale)] + self.along(du)))
+        return np.asarray(self.scale * (self.equations.gap[: len(self.scale)] + self.along(du, self.moved)))
 
     @property
     def gradients(self) -> Terms:

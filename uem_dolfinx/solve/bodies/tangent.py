@@ -136,16 +136,17 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
     """Matrix of ``-sum lambda grad^2 g``, to be added to K (collective).
 
     Args:
-        parts: of every pair, global nodes ``(k, m)``, negative if missing, and the blocks ``(k, m gdim, m gdim)``.
+        parts: of every pair, global nodes ``(k, m)``, negative if missing, and the blocks ``(k, r gdim, m gdim)``, whose rows are of the
+            first ``r`` of the nodes.
         du: a vector with the displacement's layout.
     """
     g = du.getBlockSize()
     # the number of blocks at each node bounds the length of its rows
     counts = du.duplicate()
     counts.set(0.0)
-    for nodes, _ in parts:
-        width = nodes.shape[1]
-        flat = nodes[nodes >= 0].astype(PETSc.IntType)
+    for nodes, blocks in parts:
+        width, rows_of = nodes.shape[1], nodes[:, : blocks.shape[1] // g]
+        flat = rows_of[rows_of >= 0].astype(PETSc.IntType)
         index = (flat[:, None] * g + np.arange(g, dtype=PETSc.IntType)).ravel()
         counts.setValues(index, np.full(len(index), float(width * g)), addv=PETSc.InsertMode.ADD)
     counts.assemble()
@@ -163,7 +164,7 @@ def contact_curvature(parts: Sequence[tuple[Ints, Array]], du: PETSc.Vec) -> PET
     for nodes, blocks in parts:
         if len(nodes):
             which = nodes.astype(PETSc.IntType)
-            G.setValuesBlockedRCV(which, which, blocks, addv=PETSc.InsertMode.ADD)
+            G.setValuesBlockedRCV(which[:, : blocks.shape[1] // g], which, blocks, addv=PETSc.InsertMode.ADD)
     G.assemble()
     return G
 
@@ -175,6 +176,11 @@ def convex_part(blocks: Array) -> Array:
     value, vector = np.linalg.eigh(blocks[which])
     out[which] = (vector * np.maximum(value, 0.0)[:, None]) @ vector.transpose(0, 2, 1)
     return out
+
+
+def symmetric(blocks: Array) -> Array:
+    """Symmetric parts of blocks ``(k, n, n)``."""
+    return np.asarray(0.5 * (blocks + blocks.transpose(0, 2, 1)))
 
 
 def is_skew(blocks: Array) -> bool:
@@ -205,18 +211,26 @@ def curvature_of(
     moving = [(pair, state) for pair, state in found if slides(pair)]
     if not moving and linear is None:
         return None
-    parts = [part for pair, state in moving for part in pair.curvature(state)]
+    parts = [part for pair, state in moving for part in _curvature(pair, state, apart, convex)]
     contacts = len(parts)
     parts += [] if linear is None else linear.curvature()
     for i, (nodes, blocks) in enumerate(parts):
         # in place, to save memory
         blocks = convex_part(blocks) if convex else blocks
         whole = apart or (i >= contacts and not convex and is_skew(blocks))
-        parts[i] = nodes, blocks if whole else 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        parts[i] = nodes, blocks if whole else symmetric(blocks)
     # it vanishes e.g. for a plane
     if not reduced(du.comm.tompi4py(), any([blocks.any() for _, blocks in parts])):
         return None
     return contact_curvature(parts, du)
+
+
+def _curvature(pair: Interface, state: PairState, apart: bool, convex: bool) -> list[tuple[Ints, Array]]:
+    """See ``Interface.curvature``; of averaged normals that turn with further nodes only the symmetric part, if asked for (collective)."""
+    parts = pair.curvature(state)
+    if not pair.target.averaged or (apart and not convex):
+        return parts
+    return [(nodes, symmetric(blocks)) for nodes, blocks in parts if blocks.shape[1] == blocks.shape[2]]
 
 
 def known_forces(pairs: Sequence[Interface]) -> list[tuple[Ints, Array]]:

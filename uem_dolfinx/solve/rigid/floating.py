@@ -88,6 +88,8 @@ class FloatingBodies:
         self._loads: float | None = None  # sum of the forces at the beginning of the step; None until known
         #: Open motions including those that only friction resists, if all contactors slip ``(n_motions, k)``.
         self._sliding: Array = np.zeros((0, 0))
+        #: The same along which gaps do not change, which increments leave out; others where gaps close otherwise than forces act.
+        self._left_out: Array = np.zeros((0, 0))
 
     @cached_property
     def _has_springs(self) -> bool:
@@ -164,7 +166,9 @@ class FloatingBodies:
         if self.motions is None:
             return free
         equations = rows.stopping
-        self._open = self._sliding = self.motions.open_motions(self._rates(equations))
+        self._open = self._sliding = self._left_out = self.motions.open_motions(self._rates(equations))
+        if rows.moved is not None:
+            self._left_out = self.motions.open_motions(self._rates(replace(rows, rows=rows.moved, moved=None).stopping))
         if rows.resisted is not None and self.neutral:
             # friction resists more motions, never fewer
             self._open = self.motions.open_motions(self._rates(rows.resisting))
@@ -227,7 +231,7 @@ class FloatingBodies:
         """An increment ``(n_owned * gdim,)`` without its part along neutral motions (collective)."""
         if self.motions is None:
             return du
-        return du - self.motions.part(self._sliding, du.reshape(-1, self._bodies.config.gdim)).ravel()
+        return du - self.motions.part(self._left_out, du.reshape(-1, self._bodies.config.gdim)).ravel()
 
     def _forces(self) -> Array:
         """Forces of the bodies minus the loads of contacts, at the owned nodes ``(n_owned, gdim)`` (collective)."""

@@ -219,16 +219,19 @@ def _coordinates(
     of_slots = np.zeros(len(whole), dtype=bool)
     of_slots[rows] = True
 
-    def coordinates(equations: UnitingEquations) -> RelativeCoordinates:
+    def restricted(equations: UnitingEquations, like: Restriction | None = None) -> Restriction:
         every = replace(equations, active=equations.active | of_slots, gap=np.where(of_slots, 0.0, equations.gap))
-        return RelativeCoordinates(Restriction(test.space, every, test.free, bodies.prescribed), of_slots)
+        return Restriction(test.space, every, test.free, bodies.prescribed, like=like)
 
     try:
-        trial = coordinates(whole.P)
-        back = trial if whole.moved is None else coordinates(whole.rows)
+        Q = restricted(whole.rows)
+        P = Q if whole.moved is None else restricted(whole.moved, Q)
     except (ConflictError, DependentRingError):
         return None
-    return None if trial.T.rings is not None or back.T.rings is not None else (trial, back)
+    if P.rings is not None or Q.rings is not None:
+        return None
+    trial = RelativeCoordinates(P, of_slots)
+    return trial, trial if P is Q else RelativeCoordinates(Q, of_slots)
 
 
 def _states(found: coulomb.SlotState, tangents: Ints, slip: Array) -> Sequence[Any]:

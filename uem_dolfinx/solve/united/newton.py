@@ -245,7 +245,7 @@ def _solve_linearised(
                 break
         if better is None:
             return problem, method.complete(problem, step), solves, exchanges
-        problem, near, exchanges = method.linearise(better, None), better.trial.reduce(step.du), exchanges + 1
+        problem, near, exchanges = method.linearise(better, None), better.trial.unknowns(step.du), exchanges + 1
 
 
 def _accuracy(problem: LinearisedProblem, iteration: int, wanted: float, relative: float) -> float:

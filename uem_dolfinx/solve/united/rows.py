@@ -12,7 +12,7 @@ from mpi4py import MPI
 import numpy as np
 from petsc4py import PETSc
 
-from uem_dolfinx.algebra.equations import UnitingEquations
+from uem_dolfinx.algebra.equations import MOSTLY_PRESCRIBED, UnitingEquations, least_left
 from uem_dolfinx.algebra.restriction import Restriction
 from uem_dolfinx.algebra.rings import DependentRingError
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
@@ -140,6 +140,14 @@ class OverConstraints:
             ring = error.rows[: len(own)] if independent is None else independent.of_given(error.rows[: len(own)])
         independent = self._independent(given, left, ring, firm, *masks)
         return Restriction(self._unknowns, joined(independent.equations, rigid, g), free, prescribed), independent
+
+    def turned(self, equations: UnitingEquations, like: Restriction, prescribed: Array) -> Restriction | None:
+        """P of equations in other directions than those of Q, ``like``, with its unknowns; None where they are dependent (collective)."""
+        given, rigid = self.parted(equations)
+        left = [least_left(given.direction[i] * like.free[at, None]).min() for at, i in given.by_node()] if self.shared else []
+        if self.shared and reduced(like.comm, float(min(left, default=1.0)), op=MPI.MIN) < MOSTLY_PRESCRIBED:
+            return None
+        return Restriction(like.space, joined(given, rigid, prescribed.shape[1]), like.free, prescribed, like.stacked, like=like)
 
     def _independent(self, given: UnitingEquations, free: Bools, *masks: Bools | None) -> IndependentEquations:
         from uem_dolfinx.algebra.dependent import IndependentEquations
@@ -379,10 +387,9 @@ def read_forces(pairs: Sequence[Interface], rows: Rows, y: PETSc.Vec, du: Array 
 
 def _inside(rows: Rows, m: int, du: Array | None) -> Array:
     """Penetrations along the normals of contactors, after an increment ``du``; 0 in all other of m rows (collective)."""
-    inside = np.zeros(m)
+    inside, start = np.zeros(m), 0
     if not rows.conflict:
         return inside
-    start = 0
     for pair, own in zip(rows.pairs, rows.equations):
         gap = pair.kinematics.gap if du is None else pair.kinematics.gap_rows.gaps(du)
         gap = np.where(pair.kinematics.movable & (gap < -TOUCHING * pair.config.size), gap, 0.0)

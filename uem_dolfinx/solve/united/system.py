@@ -260,12 +260,10 @@ class BodySystem:
     def _trial_of(self, rows: Rows, convex: bool = False) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
         """P, terms of the slip directions in tangent and residual, number of active contactors, and their largest gap (collective)."""
         # if equations conflict, P might eliminate other components than Q
-        contested = self.over_constraints.shared or rows.conflict
-        apart = None if contested else rows.whole.moved
-        self._petrov_galerkin = apart is not None or rows.test is not rows.frictionless
-        trial = rows.frictionless
-        if apart is not None:
-            trial, _ = self.over_constraints.restrict(apart, rows.test.free, self.bodies.prescribed)
+        trial, moved = rows.frictionless, None if rows.conflict else rows.whole.moved
+        if moved is not None:
+            trial = self.over_constraints.turned(moved, trial, self.bodies.prescribed) or trial
+        self._petrov_galerkin = trial is not rows.frictionless or rows.test is not rows.frictionless
         gaps = [one.largest_gap_here() for one in (*self.near, self.linear) if one is not None]
         united = sum([int(pair.united.sum()) for pair in self.near])
         each = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
@@ -306,7 +304,8 @@ class BodySystem:
                 raise united_rows.not_held()
             if chosen is None or self._adrift:
                 negative, either = self.solver.negative, self.unknowns.mixed and self.solver.tells_sign
-                self._not_unique = (state, negative) if negative or either else None
+                rotated = state.test is not state.rows.frictionless
+                self._not_unique = (state, negative) if rotated and (negative or either) else None
                 self._take(forces)
                 return None
             self.curvature = None if self.exchanges.straight else self.curvature
