@@ -66,7 +66,7 @@ class Restriction:
         like: Restriction | None = None,
     ):
         self.space, self.equations, self.free, self.stacked = space, equations, free, stacked
-        self.comm = space.comm
+        self.comm, self._orthonormal = space.comm, like or self
         g, n = space.block, space.n_owned
         self._sizes = ((g * n, g * space.n_global),) * 2
         self._first = g * space.first
@@ -74,7 +74,6 @@ class Restriction:
         self.united: Indices = np.unique(equations.node[equations.active])
         self.nodes: Indices = np.unique(equations.node)
         self.frames, self.lift, error = self._eliminate() if like is None else self._eliminate_like(like)
-        self._orthonormal = self if like is None else like  # restriction with the same unknowns, in orthonormal frames
         terms = equations.active[equations.row].sum()
         sums = np.array([equations.active.sum(), len(equations), terms, error is not None], dtype=np.int64)
         self.n_equations, self._n_rows, self._n_terms, wrong = reduced(self.comm, sums).tolist()
@@ -348,7 +347,7 @@ class Restriction:
         return self.space.vector(q)
 
     def unknowns(self, du: PETSc.Vec) -> PETSc.Vec:
-        """The unknowns q of an increment ``P q``."""
+        """The unknowns q of an increment ``P q``, by the orthonormal frames of the restriction that this one is ``like``."""
         return self._orthonormal.reduce(du)
 
     def transpose(self, F: PETSc.Vec) -> PETSc.Vec:
