@@ -125,7 +125,7 @@ class CheckpointError(UEMError, OSError):
 
 
 class OutputError(UEMError, OSError):
-    """Results cannot be written."""
+    """Results cannot be written, or cannot be read."""
 
     __str__ = Exception.__str__
 

@@ -69,7 +69,13 @@ def given_path(what: str, value: Any, comm: MPI.Comm) -> Path:
         given.kind(what, value, isinstance(value, (str, os.PathLike)), "the path of a file", "None is none")
         if not Path(value).name or "\0" in str(value):
             raise InputError(given.sentence(what, str(value), "the path of a file, with a name at its end"))
-        if (path := Path(value)).exists() and not (path.is_file() or path.is_dir()):
+        try:
+            odd = (path := Path(value)).exists() and not (path.is_file() or path.is_dir())
+        except OSError as error:
+            raise InputError(
+                given.sentence(what, str(value), "the path of a file", f"the system says: {error.strerror}")
+            ) from None
+        if odd:
             raise InputError(
                 given.sentence(what, str(value), "the path of a file", "a device or a pipe would be replaced by one")
             )

@@ -14,9 +14,11 @@ from dolfinx import fem
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.check_arities import ArityMismatch, check_form_arity
 from ufl.algorithms.remove_complex_nodes import remove_complex_nodes
+from ufl.constantvalue import ScalarValue
 from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_pre_traversal
 from ufl.differentiation import CompoundDerivative, Derivative
+from ufl.geometry import GeometricFacetQuantity
 
 from uem_dolfinx import compat, given
 from uem_dolfinx.errors import InputError, SpaceError
@@ -136,9 +138,16 @@ def check_expression(what: str, expression: Any, own: Any, mesh: str) -> None:
 
 
 def check_values(what: str, expression: Any, own: Any, mesh: str) -> None:
-    """Raise an InputError for a UFL expression with a test or trial function; otherwise check as ``check_expression``."""
-    if any(isinstance(part, ufl.Argument) for part in ufl.corealg.traversal.traverse_unique_terminals(expression)):
-        raise InputError(f"{what} holds a test or trial function: expected values alone; put a Function in its place")
+    """Raise an InputError for a UFL expression without finite values in cells; otherwise check as ``check_expression``."""
+    for part in ufl.corealg.traversal.traverse_unique_terminals(expression):
+        if isinstance(part, ufl.Argument):
+            raise InputError(f"{what} holds a test or trial function: expected values alone; put a Function in its place")
+        if isinstance(part, GeometricFacetQuantity):
+            raise InputError(
+                f"{what} holds {part}, which is of facets: expected values in cells; integrate it by ds, or leave it out"
+            )
+        if isinstance(part, ScalarValue) and not np.isfinite(complex(part)):
+            raise InputError(f"{what} holds the number {part}: expected finite ones")
     check_expression(what, expression, own, mesh)
 
 

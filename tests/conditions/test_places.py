@@ -85,6 +85,12 @@ def test_refused_in_a_problem(square):
         ),
         (uem.SurfaceError, ("'top' has 3 nodes", "'right' 5"), problem(uem.periodic(top, right))),
         (uem.SurfaceError, "no partner", problem(uem.periodic(right, left, map=lambda x: x * [0.0, 0.9]))),
+        (uem.SurfaceError, ("is its own image on 'top'", "two surfaces"), problem(uem.periodic(top, top))),
+        (
+            uem.SurfaceError,
+            (", 0.5)", "its own image on 'right'", "with a jump"),
+            problem(uem.periodic(right, right, map=lambda x: x * [1.0, -1.0] + [0.0, 1.0], jump=lambda s: (0.01 * s, 0.0))),
+        ),
         (uem.InputError, "the map of equations[0]", problem(uem.periodic(right, left, map=lambda x: x[:1]))),
         (uem.UserFunctionError, "the value of equations[0]", problem(uem.Equation([((1.0, 1.0), (0, 1))], b=lambda s: 1 / 0))),
     ):

@@ -173,3 +173,17 @@ def test_linear_scene_scales_with_its_load():
         answers.append((b.scene.gather(b.u) / scale, contact.resultant().force / scale))
     assert np.abs(answers[0][0] - answers[1][0]).max() < 1e-9 * 0.05
     assert np.abs(answers[0][1] - answers[1][1]).max() < 1e-8 * np.abs(answers[0][1]).max()
+
+
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_a_contact_that_is_declared_twice(coupling):
+    """Two frictionless contacts of the same surfaces share the force; the displacement is that with one of them."""
+    ends, forces = [], []
+    for n in (1, 2):
+        b = blocks(COMM, "triangle", 2, 3)
+        contacts = [uem.Contact(b.high, b.low, coupling=coupling) for _ in range(n)]
+        run(uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=b.oedometer(0.01), contacts=contacts))
+        ends.append(np.array(b.u.x.array))
+        forces.append(sum(np.array(one.resultant().force) for one in contacts))
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(forces[1], forces[0], rtol=0, atol=1e-14)

@@ -12,7 +12,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import blocks, clamp, linear, modulus, raised, run, slow
+from helpers import blocks, clamp, linear, modulus, raised, refused, run, slow
 
 import uem_dolfinx as uem
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
@@ -116,6 +116,60 @@ def test_a_law_from_outside():
         bound = np.minimum(0.3 * pair.trial.lam, STRESS * pair.friction.limits.area)
         borne = np.linalg.norm(pair.trial.friction.tau, axis=1)
         assert (borne <= bound * (1 + 1e-8)).all()
+
+
+FAULTS = [
+    (uem.UserFunctionError, "raised ZeroDivisionError", lambda value, lam: 1 / 0),
+    (uem.InputError, "is nan at (", lambda value, lam: (value * lam * np.nan, value)),
+    (uem.InputError, "[0] is -", lambda value, lam: (-1.0 - value * lam, value)),
+    (uem.InputError, "[1] is inf at (", lambda value, lam: (value * lam, value + np.inf)),
+    (uem.InputError, "has shape", lambda value, lam: (np.zeros(len(lam) + 1), value)),
+    (uem.InputTypeError, "= 'ab'", lambda value, lam: "ab"),
+    (uem.InputTypeError, "= 3: expected 2 arrays", lambda value, lam: 3),
+]
+
+
+@pytest.mark.parametrize("sliding", [False, True])
+@pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
+def test_laws_that_return_anything_else(coupling, sliding):
+    """A law that is wrong on one rank is named on all, and leaves nothing behind: mended, it is Coulomb's; what it writes is its own."""
+    wrong = []
+
+    class Law:
+        field, per_area, timed = 0.3, False, False
+
+        def limit(self, value, lam, area):
+            found = wrong[0](value, lam) if wrong and COMM.rank == wrong[1] else (value * lam, value)
+            lam[:] = np.nan
+            return found
+
+    if sliding:
+        Law.sliding = lambda self, value, lam, area, speed: (*self.limit(value, lam, area), 0.0)
+    ends = []
+    for law in (0.3, Law()):
+        b = blocks(COMM, "triangle", 2, 3)
+        contact = uem.Contact(b.high, b.low, friction=law, coupling=coupling)
+        bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=(0.02, -0.01))]
+        problem = uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0)), b.u, bcs=bcs, contacts=[contact])
+        for error, words, fault in FAULTS if law != 0.3 else ():
+            wrong[:] = [fault, COMM.allreduce(COMM.rank if len(contact.pair.nodes) else -1, op=MPI.MAX)]
+            refused(error, [words, f"contact '{contact.name}': friction, Law."], problem.solve)
+        wrong.clear()
+        problem.solve()
+        ends.append(np.array(b.u.x.array))
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-13)
+
+
+def test_laws_without_what_they_need():
+    """A law without the attributes of one is refused by their names."""
+
+    class Law:
+        limit = sliding = None
+
+    b = blocks(COMM, "triangle", 1, 1)
+    for name, value in (("field", 0.3), ("per_area", False), ("timed", False)):
+        refused(uem.InputTypeError, f"attribute {name}", lambda: uem.Contact(b.high, b.low, friction=Law()))
+        setattr(Law, name, value)
 
 
 def test_a_proportional_limit_has_no_rest():

@@ -143,6 +143,16 @@ def test_steps_that_end(left, steps):
     assert len(list(uem.time_steps(Flight(2, 12).problem, 0.01, 0.01 * (1 + left)))) == steps
 
 
+def test_runs_without_a_step():
+    """A run that ends where it begins has no step; with a velocity that is no number it does not begin, with any scheme."""
+    bar = Flight(2, 4)
+    assert list(uem.time_steps(bar.problem, None, bar.dynamics.time)) == []
+    if COMM.rank == COMM.size - 1:
+        bar.dynamics.velocity.x.array[:] = np.nan
+    with pytest.raises(uem.NotFiniteError, match="the velocity at time 0 contains NaN"):
+        next(iter(uem.time_steps(bar.problem, None, 1.0)))
+
+
 def test_steps_that_shrink():
     """A bar that is squeezed has shorter cells, and shorter steps each time that its cells are shorter by a tenth."""
     bar = Flight(2, 90, law=uem.NeoHooke)

@@ -143,8 +143,13 @@ def test_the_shape_of_bodies_of_revolution():
     s.hold(1, 0.0)
     p = fem.Constant(s.mesh, 0.2)
     law = uem.NeoHooke(1.0, 0.3, kind="axisymmetric")
-    problem = s.problem(law.residual(s.u, s.v) * ufl.dx + p * s.v[1] * uem.ds(s.side(1, H)), rtol=1e-12)
-    problem.solve()
+
+    def solved():
+        problem = s.problem(law.residual(s.u, s.v) * ufl.dx + p * s.v[1] * uem.ds(s.side(1, H)), rtol=1e-12)
+        problem.solve()
+        return problem
+
+    problem = solved()
     x = ufl.SpatialCoordinate(s.mesh)
     J = (s.u[1] ** 2 + x[0]) * ufl.dx
     by_p, by_shape = uem.gradient(problem, J, [p, x])
@@ -154,7 +159,7 @@ def test_the_shape_of_bodies_of_revolution():
     def value(h, shape):
         p.value = start if shape else start + h
         s.mesh.geometry.x[:] = nodes + h * way * shape
-        problem.solve()
+        solved()
         return uem.integrate(J)
 
     h = 1e-4

@@ -168,6 +168,33 @@ def test_shapes(folder):
     refused(uem.MissingFileError, "run.bin", lambda: uem.read_results(folder / "run"))
 
 
+def _cut(path, n):
+    path.write_bytes(path.read_bytes()[:n])
+
+
+DAMAGE = {
+    "numbers": (".bin", lambda path: _cut(path, 100), "run.bin ends before"),
+    "places": (".xdmf", lambda path: path.write_text(path.read_text().replace('Seek="', 'Seek="9999999')), "run.bin ends before"),
+    "half": (".xdmf", lambda path: _cut(path, 300), "run.xdmf cannot be read (ParseError"),
+    "widths": (".xdmf", lambda path: path.write_text(path.read_text().replace(' 3"', ' 4"')), "cannot be read (ValueError"),
+    "cells": (".xdmf", lambda path: path.write_text(path.read_text().replace("Triangle", "Rhombus")), "cannot be read (KeyError"),
+    "columns": (".csv", lambda path: path.write_text("time,step\n0.5,1\n1.0\n"), "line 3 of"),
+    "names": (".csv", lambda path: path.write_text("time,time\n0.5,1\n"), "two columns 'time'"),
+    "letters": (".csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "run.csv cannot be read (UnicodeDecodeError"),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_damaged_files(folder, what):
+    """Files that were cut off or changed are named with what is wrong, on all ranks."""
+    written(folder, "triangle")
+    ending, damage, words = DAMAGE[what]
+    if COMM.rank == 0:
+        damage(folder / f"run{ending}")
+    COMM.barrier()
+    refused(uem.OutputError, words, lambda: uem.read_results(folder / "run").function("displacement"))
+
+
 def test_a_history_alone(folder):
     b = blocks(COMM, "triangle", 2, 2)
     problem = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=b.oedometer(0.1), contacts=[uem.GeneralContact()])

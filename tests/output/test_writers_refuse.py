@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import ufl
 from helpers import blocks, raised
 from ramp_scenes import COMM, five_steps, nothing
 
@@ -30,6 +31,18 @@ def test_a_field_of_the_problems_own_name(name, folder):
         "the problem's own field has this name",
         lambda: uem.ResultsWriter(folder / "r", problem, fields={name: problem.u[0]}),
     )
+
+
+def test_columns_and_values():
+    """A column of a name that the table has, numbers that are not finite, and what is of facets."""
+    problem, _ = five_steps(False, nothing)
+    raised(uem.InputError, "two columns 'step'", lambda: uem.HistoryWriter("never.csv", problem, columns={"step": lambda: 1.0}))
+    raised(uem.InputError, "the path of a file; the system says", lambda: uem.HistoryWriter("a" * 300, problem))
+    for value, words in (
+        (np.nan * problem.u[0], "holds the number nan"),
+        (ufl.FacetNormal(problem.config.mesh)[0], "is of facets"),
+    ):
+        raised(uem.InputError, words, lambda: uem.ResultsWriter("never", problem, fields={"a": value}))  # noqa: B023
 
 
 def test_steps_switch_contacts():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import at, blocks, box, clamp, linear, modulus, raised, run, scene, st_venant
+from helpers import at, blocks, box, clamp, linear, modulus, raised, run, scene, slow, st_venant
 from petsc4py import PETSc
 
 import uem_dolfinx as uem
@@ -80,6 +80,30 @@ def test_target_between_two_cells(cell):
     raised(
         uem.OrientationError, "'inside'.*between two cells", lambda: uem.UnitedProblem(F, u, contacts=[uem.Contact(high, inside)])
     )
+
+
+@pytest.mark.parametrize(
+    ("cell", "body", "coupling"),
+    [
+        ("triangle", 0, "mortar"), ("triangle", 1, "node_to_surface"), ("quadrilateral", 1, "mortar"),
+        ("tetrahedron", 1, "node_to_surface"), slow("hexahedron", 0, "node_to_surface"),
+    ],
+)  # fmt: skip
+def test_degenerate_facets(cell, body, coupling):
+    """A facet of either side whose nodes have been moved onto each other is named; without contact the flat cell is."""
+    b = blocks(COMM, cell, 2, 2)
+    g, x, own = b.gdim, b.scene.mesh.geometry.x, np.unique(compat.geometry_dofs(b.scene.mesh)[b.scene.body == body])
+    x[own[(np.abs(x[own, g - 1]) < 1e-9) & (x[own, 0] < 0.6)], 0] = 0.0
+    words = "a facet without length" if g == 2 else "a facet without area"
+    contact = uem.Contact(b.high, b.low, coupling=coupling)
+    error = uem.SurfaceError
+    if (cell, body, coupling) == ("triangle", 1, "node_to_surface"):
+        # nodes alone do not show their facets
+        error, words = uem.MeshError, "the cell of the mesh at .* is flat"
+    raised(error, f"{words}.*mend the mesh", lambda: problem_of(b, contact).solve())
+    if cell in ("triangle", "tetrahedron"):
+        alone = uem.UnitedProblem(linear(b.u, 1.0), b.u, bcs=[*clamp(b.V, b.bottom), *clamp(b.V, b.top)])
+        raised(uem.MeshError, "the cell of the mesh at .* is flat", alone.solve)
 
 
 def test_contact_before_its_problem():

@@ -70,6 +70,16 @@ def test_dynamics(options, error, words):
     refused(error, words, make)
 
 
+def test_damping_without_velocity():
+    """A damping that does not depend on the velocity is a load, or nothing."""
+    b = blocks(COMM, "triangle", 2, 2)
+    v = ufl.TestFunction(b.V)
+    for form in (v[0] * ufl.dx, ufl.inner(b.u, v) * ufl.dx):
+        dynamics = uem.Dynamics(uem.lumped_mass(b.V, 1.0), damping=lambda rate, form=form: form)
+        words = ("damping(v) does not depend on the velocity", "other forces into F")
+        refused(uem.InputError, words, lambda: uem.UnitedProblem(linear(b.u, 1.0), b.u, dynamics=dynamics))  # noqa: B023
+
+
 def broken():
     raise KeyError("no damping")
 

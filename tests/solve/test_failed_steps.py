@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from dolfinx import fem
-from helpers import blocks, clamp, gathered_matrix, linear, raised, st_venant
+from helpers import blocks, clamp, gathered_matrix, linear, modulus, raised, refused, st_venant
 from resting_scenes import COMM, Bar
 
 import uem_dolfinx as uem
@@ -120,3 +120,17 @@ def test_back_to_nothing():
     free = np.concatenate(COMM.allgather(problem.bodies.free[: problem.config.n_owned].ravel()))
     least = np.linalg.eigvalsh(gathered_matrix(problem.bodies.update_tangent())[np.ix_(free, free)])[0]
     assert np.linalg.norm(b.scene.gather(b.u)) <= rounding[-2] / least < 1e-12 * 0.2
+
+
+@pytest.mark.parametrize("moduli", [(-1.0, -1.0), (1.0, -1.0)])
+def test_a_tangent_of_the_wrong_sign(moduli):
+    """A negative modulus is named as an indefinite tangent of the bodies, without advice on meshes; what fails otherwise is not."""
+    b = blocks(COMM, "triangle", 2, 3)
+    F, contacts = linear(b.u, modulus(b.scene, *moduli)), [uem.Contact(b.high, b.low)]
+    problem = uem.UnitedProblem(F, b.u, bcs=b.oedometer(0.01), contacts=contacts)
+    error = refused(uem.ConvergenceError, ("the tangent of the bodies is indefinite", "along x at (", "sign of F"), problem.solve)
+    assert "finer" not in str(error) and not b.u.x.array.any()
+    b = blocks(COMM, "triangle", 2, 3)
+    contacts = [uem.Contact(b.high, b.low)]
+    problem = uem.UnitedProblem(st_venant(b.u, 1.0), b.u, bcs=b.oedometer(0.1), contacts=contacts, max_iterations=1)
+    assert "indefinite" not in str(refused(uem.ConvergenceError, "no convergence", problem.solve))

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, TypeAlias
 
+from mpi4py import MPI
+
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -191,6 +193,7 @@ class Periodic(given.Sealed):
         # a node on the axis is its own image
         node = np.column_stack([config.to_global(follower), there])
         n, distinct = len(node), node[:, 0] != node[:, 1]
+        self._refuse_own_images(config, follower[~distinct], bool(distinct.any()), role)
         c = np.empty((n, g, 2, g))
         c[:, :, 0], c[:, :, 1] = np.eye(g), -R
         node = np.broadcast_to(node[:, None], (n, g, 2))
@@ -212,6 +215,20 @@ class Periodic(given.Sealed):
                     )
             return images
         return x @ self.turn if self.turn is not None else x + shift
+
+    def _refuse_own_images(self, config: Configuration, own: Indices, others: bool, role: str) -> None:
+        """Refuse followers that follow themselves, ``own (k,)``, if all do, or if they jump; without a rotation (collective)."""
+        if self.turn is not None:
+            return
+        jumps = given.function(self.b) or bool(values_of("jump", self.b, None).any())
+        lone, error = not reduced(config.comm, others, op=MPI.LOR), None
+        if len(own) and (lone or jumps):
+            error = SurfaceError(
+                f"{role}: the node at {config.describe(int(own[0]))} of '{name_of(self._follower)}' is its own image on "
+                f"'{name_of(self._leader)}', and would follow itself{'' if lone else ' with a jump'}: expected two surfaces, or a map "
+                "from one onto the other"
+            )
+        agree(config.comm, error)
 
     def _check_sizes(self, config: Configuration, n_follower: int, n_leader: int, role: str) -> None:
         n = gathered(config.comm, np.array([n_follower, n_leader])).sum(axis=0)

@@ -417,8 +417,8 @@ class Contact(WatchedContact, given.Sealed):
             )
         return Sliding(
             self.config, nodes, discretisation, law=law, value=np.zeros(len(nodes)) if value is None else value,
-            limits=Limits(lambda at: self.areas_facing(nodes, at, False), duration), keeps_feet=self.sliding != "finite",
-            value_now=self._friction_now, wear=wear_of(self, nodes) if self.wears else None,
+            limits=Limits(lambda at: self.areas_facing(nodes, at, False), duration, self.name, self.config.X[nodes]),
+            keeps_feet=self.sliding != "finite", value_now=self._friction_now, wear=wear_of(self, nodes) if self.wears else None,
         )  # fmt: skip
 
     _tie = tie_of  # permanent tie or bonds

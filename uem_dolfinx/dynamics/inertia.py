@@ -125,6 +125,8 @@ class Dynamics(given.Sealed):
                 "the mass is of another mesh than the displacement, or has another numbering, as a collapsed part of a mixed space: make "
                 "it with the function space of the displacement, or uem.function_space(mesh, degree, (gdim,))"
             )
+        elif self.mass.config.places != config.places:
+            error = SpaceError("nodes have moved in the mesh since the mass was made: make a new mass")
         # the sizes may agree by chance on other ranks
         agree(config.comm, error)
         self.velocity = fem.Function(config.V, name="velocity")

@@ -14,9 +14,11 @@ from dolfinx import fem
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Indices, Ints, pairs_of_equals, sums_of_rows
-from uem_dolfinx.errors import OrientationError
+from uem_dolfinx.errors import OrientationError, SurfaceError
+from uem_dolfinx.geometry.cells import FLAT_CELL
 from uem_dolfinx.geometry.configuration import Configuration
-from uem_dolfinx.geometry.shapes import FacetShape, facet_shape, nodal_area_slopes, nodal_area_vectors, unit_normals
+from uem_dolfinx.geometry.nodes import described
+from uem_dolfinx.geometry.shapes import FacetShape, area_vectors, facet_shape, nodal_area_slopes, nodal_area_vectors, unit_normals
 from uem_dolfinx.geometry.tags import Tag
 from uem_dolfinx.parallel import Exchange, agree, count_keys, gathered, reduced
 
@@ -44,6 +46,7 @@ class TargetFacets:
 
     Raises:
         OrientationError: if a facet lies between two cells, so that the outward direction is undefined.
+        SurfaceError: if a facet is degenerate, so that it has no normal.
     """
 
     _placed: FacetData | None = None  # the facets at their last positions; None before the first call of ``current``
@@ -86,12 +89,24 @@ class TargetFacets:
 
     def _orient(self, cell_dofs: Indices) -> None:
         """Find the sign that makes the parametrisation's normal point outwards, away from the cell's middle."""
-        X, x = self.config.X, self.config.X[self.dofs]
+        X, x = self.config.X[cell_dofs[self.cells]], self.config.X[self.dofs]
         tab = self.shape.at_middle(len(x))
-        inward = X[cell_dofs[self.cells]] - np.einsum("na,nag->ng", tab.N, x)[:, None]
+        inward = X - np.einsum("na,nag->ng", tab.N, x)[:, None]
+        self._refuse_flat(x, np.linalg.norm(area_vectors(tab, x), axis=1), np.linalg.norm(np.ptp(X, axis=1), axis=1))
         height = np.einsum("ng,nkg->nk", unit_normals(tab, x), inward)
         self.sign = np.where(height.mean(axis=1) > 0, -1.0, 1.0)
         self.depth: Array = np.abs(height).max(axis=1)  # depth of the cell behind each facet, a length ``(m,)``
+
+    def _refuse_flat(self, x: Array, area: Array, size: Array) -> None:
+        """SurfaceError for facets at ``x (m, nn, gdim)`` without ``area (m,)``, next to cells of these sizes ``(m,)`` (collective)."""
+        flat, error = np.flatnonzero(area <= FLAT_CELL * size**self.shape.dim), None
+        if len(flat):
+            what = "length" if self.shape.dim == 1 else "area"
+            error = SurfaceError(
+                f"{self.role} '{self.tag.name}' has a facet without {what} (it is degenerate) at {described(x[flat[0]].mean(axis=0))}, "
+                "where it has no normal: mend the mesh, or leave this facet out of the surface"
+            )
+        agree(self.config.comm, error)
 
     def _refuse_inner(self) -> None:
         """Raise on facets that lie between two cells, on any rank."""

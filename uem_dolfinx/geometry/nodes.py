@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from hashlib import blake2b
 from typing import Any
 
 from mpi4py import MPI
@@ -15,7 +16,7 @@ from petsc4py import PETSc
 
 from uem_dolfinx import forms
 from uem_dolfinx.arrays import AnyArray, Array, Bools, Ints, sums_of_rows
-from uem_dolfinx.errors import MeshError
+from uem_dolfinx.errors import InputError, MeshError
 from uem_dolfinx.parallel import Exchange, agree, gathered, reduced
 
 
@@ -34,6 +35,7 @@ class Nodes:
         n_global: global numbers of all ranks' nodes are below it.
         X: reference positions of the local nodes ``(n_local, gdim)``, ghosts included.
         size: diagonal of the reference bounding box of the whole model, the length that tolerances scale with.
+        places: digest of the positions of this rank's nodes of the mesh when these nodes were found.
 
     Raises:
         MeshError: if a node's position is not finite.
@@ -41,7 +43,7 @@ class Nodes:
 
     def __init__(self, V: Any):
         check_places(V.mesh)
-        self.V, self.mesh = V, V.mesh
+        self.V, self.mesh, self.places = V, V.mesh, _digest_of_places(V.mesh)
         self.comm = V.mesh.comm
         self.gdim: int = V.mesh.geometry.dim
         self.block: int = V.dofmap.index_map_bs
@@ -55,6 +57,14 @@ class Nodes:
         bounds = np.concatenate([np.max(sign * self.X, axis=0, initial=-np.inf) for sign in (-1.0, 1.0)])
         self.comm.Allreduce(MPI.IN_PLACE, bounds, op=MPI.MAX)
         self.size = float(np.linalg.norm(bounds[self.gdim :] + bounds[: self.gdim]))
+
+    def refuse_moved(self) -> None:
+        """Refuse a mesh whose nodes have moved on this rank since, by an InputError (to be agreed on)."""
+        if _digest_of_places(self.mesh) != self.places:
+            raise InputError(
+                "nodes have moved in the mesh since the problem was made, whose surfaces, gaps and equations are of their places then: "
+                "expected the same mesh.geometry.x; move nodes first, and make a new problem for every mesh, with a new mass"
+            )
 
     def modes(self, centred: bool = False) -> Array:
         """Constants of each component at owned nodes ``(n_owned, n_modes, block)``, ``centred`` ones of one size (collective)."""
@@ -179,6 +189,11 @@ def check_places(mesh: Any) -> None:
             "coordinates; correct the mesh, or the script that has moved its nodes"
         )
     agree(mesh.comm, error)
+
+
+def _digest_of_places(mesh: Any) -> bytes:
+    """Digest of the positions of this rank's nodes of a mesh."""
+    return blake2b(np.ascontiguousarray(mesh.geometry.x).data).digest()
 
 
 class Halo:

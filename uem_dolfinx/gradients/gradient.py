@@ -244,6 +244,7 @@ def check_controls(problem: UnitedProblem, what: str, handed: Any, later: bool =
     Collective.
     """
     with agreed(problem.comm):
+        problem.config.refuse_moved()
         if not problem.progress.steps and not later:
             raise InputError("the problem has taken no step: expected a state of equilibrium; solve it first")
         if what == "controls":

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +53,6 @@ class History(given.Sealed):
         self.problem = problem
         self._first = problem.progress.steps
         self._records = Records(folder)
-        self._places: list[bytes] = []  # digest of the positions of the nodes in each step
         self._start: Record | None = None  # initial state of a motion; None in statics
         self._led: list[Any] = []  # Constants and contacts ramped by steps, referenced here so that their ids stay unique
         #: Numbers of the steps that ramped them first; what their values end at has no share in steps before.
@@ -82,7 +80,6 @@ class History(given.Sealed):
                 "the steps of an arc depend on each other by their lengths, of which there are no derivatives: record steps of given load"
             )
         self._records.cut(problem.progress.steps - self._first - 1)
-        self._places[len(self._records) :] = [_places(problem)]
         taken = problem.progress.taken
         new = [one for one, *_ in taken.led if all(one is not other for other in self._led)]
         self._led += new
@@ -173,7 +170,6 @@ class History(given.Sealed):
         refuse_without_state(problem, given_forms, self._state())
         refuse_idle_controls(problem, "controls", some, given_forms)
         self.check_controls(some)
-        self._refuse_moved_nodes()
         sweep = Sweep(problem, some)
         with self._replayed():
             begun = False
@@ -212,7 +208,6 @@ class History(given.Sealed):
         controls = [control for control, _ in pairs]
         refuse_idle_controls(problem, "direction", controls)
         self.check_controls(controls, "direction")
-        self._refuse_moved_nodes()
         from uem_dolfinx.gradients.forward import Forward
 
         forward = Forward(problem, pairs)
@@ -253,17 +248,6 @@ class History(given.Sealed):
         record = replace(record, shares=none | record.shares)
         self._place(record)
         return record
-
-    def _refuse_moved_nodes(self) -> None:
-        """Refuse steps that were taken with other positions of the nodes (collective)."""
-        now = _places(self.problem)
-        with agreed(self.problem.comm):
-            for k, then in enumerate(self._places):
-                if then != now:
-                    raise InputError(
-                        f"the nodes have moved since step {k + 1} of the history, which would be swept over at their present places: "
-                        "expected nodes that stay where they are while steps are recorded, and until there is a gradient"
-                    )
 
     def check_controls(self, controls: Sequence[AnyControl], what: str = "controls") -> None:
         """Refuse controls by which recorded steps have no derivatives (collective)."""
@@ -366,11 +350,6 @@ class History(given.Sealed):
             pair.take(state)
         if problem.dynamics is not None and record is not self._start:
             problem.dynamics.begin(record.dt)
-
-
-def _places(problem: UnitedProblem) -> bytes:
-    """Digest of the positions of this rank's nodes."""
-    return blake2b(np.ascontiguousarray(problem.config.mesh.geometry.x).tobytes()).digest()
 
 
 def _friction_of(pair: Any) -> Array | None:

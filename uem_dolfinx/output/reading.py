@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from xml.etree import ElementTree
 
 from mpi4py import MPI
@@ -15,12 +15,14 @@ import numpy as np
 from dolfinx import fem
 
 from uem_dolfinx import compat, forms, given
-from uem_dolfinx.arrays import AnyArray, Array, Ints
-from uem_dolfinx.errors import InputError, MissingFileError, SpaceError
+from uem_dolfinx.arrays import AnyArray, Array, Ints, is_whole
+from uem_dolfinx.errors import InputError, MissingFileError, OutputError, SpaceError, UEMError
 from uem_dolfinx.files import given_path, on_rank_0
 from uem_dolfinx.output.xdmf import TOPOLOGIES, geometry_degree, numbering_of
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.restart.numbering import n_cells
+
+T = TypeVar("T")
 
 #: Cells by their name in XDMF, with the degree of their geometry.
 OF_TOPOLOGY = {name: (cell, 1 if n == len(forms.reference_topology(cell)[0]) else 2) for (cell, n), name in TOPOLOGIES.items()}
@@ -46,7 +48,8 @@ class Results:
         def read() -> tuple[Any, ...]:
             if not (xdmf.exists() or table.exists()):
                 raise MissingFileError(f"there are no results {stem}: expected {xdmf} or {table}, as a ResultsWriter writes them")
-            return _described(xdmf) if fields and xdmf.exists() else ([], None), _columns(table), _columns(pairs)
+            described = _read(_described, xdmf) if fields and xdmf.exists() else ([], None)
+            return described, _read(_columns, table), _read(_columns, pairs)
 
         (steps, grid), self.history, self.pairs = on_rank_0(comm, f"the results {stem} cannot be read", read)
         self._path, self._steps, self._numbers = xdmf, [fields for _, _, fields in steps], stem.with_name(stem.name + ".bin")
@@ -101,7 +104,12 @@ class Results:
         return f"Results('{self._path.with_suffix('')}', {len(self.times)} steps, fields: {', '.join(self.names) or 'none'})"
 
     def _array(self, item: Item) -> AnyArray:
-        """Rows of a table in the file ``(rows, width)``, read where they are used."""
+        """Rows of a table in the file ``(rows, width)``, read where they are used; OutputError if the file has them not."""
+        size = self._numbers.stat().st_size
+        if not 0 <= item.seek <= size or not 0 <= 8 * item.rows * item.width <= size - item.seek:
+            raise OutputError(
+                f"{self._numbers} ends before the numbers that {self._path} describes: it was cut off, or is of another run"
+            )
         return np.memmap(self._numbers, item.kind, "r", offset=item.seek, shape=(item.rows, item.width))
 
     def function(self, name: str, step: int = -1, shape: tuple[int, ...] | None = None) -> fem.Function:
@@ -121,7 +129,7 @@ class Results:
         if self.mesh is None or not self._steps:
             raise InputError(f"{self._path} does not exist, or has no step: expected the fields of a ResultsWriter")
         given.word("name", name, self.names)
-        given.kind("step", step, isinstance(step, (int, np.integer)), "a whole number")
+        given.kind("step", step, is_whole(step), "a whole number")
         if not -len(self._steps) <= step < len(self._steps):
             raise InputError(
                 given.sentence("step", step, f"one of {len(self._steps)} steps, counted from 0, or from -1 backwards")
@@ -154,6 +162,19 @@ class Item:
         self.kind = {"Little": "<", "Big": ">"}[element.get("Endian")] + {"Int": "i8", "Float": "f8"}[element.get("NumberType")]
 
 
+def _read(read: Callable[[Path], T], path: Path) -> T:
+    """What a function reads from a file; OutputError if it is damaged."""
+    try:
+        return read(path)
+    except (ElementTree.ParseError, csv.Error, AttributeError, LookupError, TypeError, ValueError) as error:
+        if isinstance(error, UEMError):
+            raise
+        raise OutputError(
+            f"{path} cannot be read ({type(error).__name__}: {error}): expected a file as a ResultsWriter writes it; it is damaged, or of "
+            "another program"
+        ) from error
+
+
 def _described(path: Path) -> tuple[list[tuple[float, int, dict[str, Item]]], tuple[str, Item, Item] | None]:
     """Times, numbers and fields of the steps of an XDMF file, and the type, cells and nodes of its mesh."""
     steps, grid = [], None
@@ -165,6 +186,10 @@ def _described(path: Path) -> tuple[list[tuple[float, int, dict[str, Item]]], tu
         fields = {one.get("Name"): Item(one[0], one.get("Center") == "Node") for one in found.iter("Attribute")}
         steps.append((float(time), int(number), fields))  # type: ignore[arg-type]
         grid = topology.get("TopologyType"), Item(topology[0]), Item(geometry[0])  # type: ignore[union-attr,index]
+        for name, one in fields.items():
+            if one.width not in (1, 3, 9) or one.rows != grid[2 if one.nodal else 1].rows:
+                raise ValueError(f"'{name}' has {one.rows} rows of {one.width} numbers")
+        OF_TOPOLOGY[grid[0]]
     if grid is not None and not (numbers := path.with_suffix(".bin")).exists():
         raise MissingFileError(f"{numbers} does not exist: expected it next to its .xdmf file, which describes it")
     return steps, grid  # type: ignore[return-value]
@@ -177,7 +202,14 @@ def _columns(path: Path) -> Mapping[str, AnyArray]:
     with path.open(newline="", encoding="utf-8") as file:
         names, *rows = list(csv.reader(file)) or [[]]
     found: dict[str, AnyArray] = {}
+    for n, row in enumerate(rows, 2):
+        if len(row) != len(names):
+            raise OutputError(
+                f"line {n} of {path} has {len(row)} values: expected {len(names)}; remove the line if it was cut off"
+            )
     for k, name in enumerate(names):
+        if name in found:
+            raise OutputError(f"{path} has two columns '{name}': expected names that differ; rename one in its first line")
         column = [row[k] for row in rows]
         try:
             found[name] = np.array([float(value) if value else np.nan for value in column])
@@ -201,6 +233,7 @@ def read_results(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, *, mesh: Any
 
     Raises:
         MissingFileError: if there are neither fields nor a history.
+        OutputError: for files that are damaged or of another program; also later, where numbers are missing.
         SpaceError: if the fields are of another mesh.
         InputError, InputTypeError: for an invalid path.
     """

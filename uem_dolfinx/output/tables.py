@@ -92,6 +92,8 @@ class CsvTable(Closing):
         whose: str = "a table",
     ):
         self.columns, self.comm, self.path = list(columns), comm, given_path("path", path, comm)
+        if twice := [name for k, name in enumerate(self.columns) if name in self.columns[:k]]:
+            raise InputError(f"the table {self.path} has two columns '{twice[0]}': choose another name for that of columns=")
         refuse_shared(self.path, comm, whose)
         self.whose = whose
         self._key = 0 if key is None else self.columns.index(key)

@@ -55,6 +55,16 @@ def check_residual(F: Any, u: fem.Function, what: str = "F") -> None:
             raise InputError(f"{what} holds the number {part}: expected finite ones; check parameters and loads")
 
 
+def check_damping(form: Any, u: fem.Function, dynamics: Any) -> None:
+    """Refuse a damping form as a residual, see ``check_residual``, and by an InputError if it does not depend on the velocity."""
+    check_residual(form, u, "the damping form")
+    if dynamics.past not in form.coefficients():
+        raise InputError(
+            "damping(v) does not depend on the velocity: expected a form of it, as eta * ufl.inner(rate, v) * ufl.dx; put other forces "
+            "into F"
+        )
+
+
 def check_dynamics(dynamics: Any, contacts: Sequence[Any], others: Mapping[str, Any], usual: bool) -> Dynamics | None:
     """The dynamics of a problem, or None.
 
@@ -206,10 +216,11 @@ def check_values(problem: Any, wanted: Array) -> None:
 
     Raises:
         NotFiniteError: for an unknown or a Dirichlet value that is not finite, with its condition, value and position.
-        InputError: if Constants and numbers in the residual, Dirichlet conditions, points, couplings or equations differ between ranks,
-            with the first of them and two ranks.
+        InputError: if nodes of the mesh have moved; if Constants and numbers in the residual, Dirichlet conditions, points, couplings or
+            equations differ between ranks, with the first of them and two ranks.
     """
     with agreed(problem.comm):
+        problem.config.refuse_moved()
         _check_finite(problem.config, problem.bodies.bcs, wanted)
     if problem.progress.steps == 0:
         _warn_of_two_values(problem.config, problem.bodies.bcs, wanted)

@@ -176,7 +176,7 @@ class UnitedProblem(given.Sealed):
         self.ties, self.equations, self.couplings, self.points = ties, equations, couplings, points
         damping = dynamics.attach(self.config) if dynamics is not None else None
         if damping is not None:
-            checks.check_residual(damping, u, "the damping form")
+            checks.check_damping(damping, u, dynamics)
         # cells held by conditions or made rigid by a coupling may have no stiffness, and may be missing in F
         F, at_points = revolved(F if self.config.unknowns.mixed else in_all_cells(F, u, bool(self.materials))), None
         if points or couplings:
@@ -334,6 +334,7 @@ class UnitedProblem(given.Sealed):
             TunnellingError, UserFunctionError: after the committed state has been restored.
         """
         from uem_dolfinx.solve.rigid.rest import converge_or_rest
+        from uem_dolfinx.solve.rigid.unheld import explain
 
         for pair in self.interfaces:
             check_moved(pair)
@@ -350,8 +351,7 @@ class UnitedProblem(given.Sealed):
         except UEMError as error:
             stiffness = self.bodies.stiffness
             self.restore()
-            if isinstance(error, MENDABLE):
-                self.watch.name_corner(stiffness, error)
+            explain(self, error, stiffness, isinstance(error, MENDABLE))
             raise
         return history
 

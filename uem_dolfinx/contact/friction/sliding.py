@@ -75,7 +75,7 @@ class Sliding:
         self.last: LastStep | None = None
         self.pivot = Pivot.begin(np.zeros(n), *np.zeros((2, n, g)))
         #: The last state and what its limits depend on, and these limits.
-        self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 5, (np.zeros(n), np.zeros(n))
+        self._cones: tuple[tuple[Any, ...], tuple[Array, Array]] = (None,) * 6, (np.zeros(n), np.zeros(n))
 
     def set(self, law: FrictionLaw, value: Array) -> None:
         """Set the law and the values of its parameter ``(n,)``."""
@@ -199,6 +199,7 @@ class Sliding:
             away, tau = away + self.frame.way.relative(du), seen.tau
         lam, forced = seen.lam, self.frame.forced(away, self._lost)
         by = stick_slip.Seen(lam, self.frame.tangential(tau), self.bound(state, lam), self.frame.along(away), forced)
+        self.limits.agree(self.config.comm)
         turned = replace(_of(state), direction=self.directions(state))
         (forces, lengths), active = rounding, self.active(state)
         return stick_slip.find_violations(violated, turned, active, by, force_rounding=forces, gap_rounding=lengths)
@@ -407,6 +408,7 @@ class Sliding:
         start, end = (np.where(stuck, 0.0, way) for way in self._ways(kinematics))
         # in a corner, friction is the part within the cones of its facets
         slopes = self.limits.cones(np.linalg.norm(state.force, axis=1))
+        self.limits.agree(self.config.comm)
         tau = np.where(held, friction_in(kinematics.corners, state, committed.facet, slopes, end) * share, _of(state).tau)
         first, last = (0.0 * start, 2.0 * end) if self.limits.whole else (start, end)
         return tau, start, end, stick_slip.work(_of(committed).tau, tau, first, last, self.frame.cornered)

@@ -114,6 +114,11 @@ def of_rate(law: FrictionLaw) -> bool:
     return slides_otherwise(law) and law.timed
 
 
+def is_of_users(law: FrictionLaw) -> bool:
+    """Whether a law is a class of users, whose methods may return anything."""
+    return not type(law).__module__.startswith(given.PACKAGE)
+
+
 def as_law(friction: Any) -> FrictionLaw:
     """The friction law of user input: Coulomb's law for a number or a function; refuse other types."""
     if hasattr(friction, "limit"):
@@ -123,8 +128,11 @@ def as_law(friction: Any) -> FrictionLaw:
 
 
 def given_friction(friction: Any) -> Field | FrictionLaw:
-    """Checked user input for friction: a number, a function or a law."""
+    """Checked user input for friction: a number, a function or a law with all that ``FrictionLaw`` and ``RateLaw`` have."""
     law = as_law(friction)
+    for what in ("field", "per_area", *(("timed",) if slides_otherwise(law) else ())):
+        expected = f"a law with {what}, and limit(value, lam, area)"
+        given.kind("friction", friction, hasattr(law, what), expected, f"give the class an attribute {what}, see FrictionLaw")
     given_field("friction", law.field, given.NOT_NEGATIVE)
     return law if hasattr(friction, "limit") else law.field
 

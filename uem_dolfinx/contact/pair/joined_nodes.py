@@ -128,7 +128,7 @@ class JoinedSliding(Sliding):
             discretisation,
             law=JoinedLaw([one.limits.law for one in own], label),
             value=np.concatenate([one.value for one in own]),
-            limits=Limits(areas, first.limits.duration),
+            limits=Limits(areas, first.limits.duration, "", np.concatenate([one.config.X[one.nodes] for one in own])),
             keeps_feet=first.keeps_feet,
             value_now=lambda kinematics: None,
         )

@@ -22,9 +22,11 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import slides
 from uem_dolfinx.contact.seam.state import PairState
-from uem_dolfinx.errors import InvertedElementError, NotFiniteError, SpaceError, UEMError
+from uem_dolfinx.errors import InvertedElementError, MeshError, NotFiniteError, SpaceError, UEMError
 from uem_dolfinx.geometry.axisymmetry import displacement_gradient, revolved
+from uem_dolfinx.geometry.cells import flat_cells
 from uem_dolfinx.geometry.configuration import Configuration
+from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.log import compiling, timed
 from uem_dolfinx.materials.elastic import differentiate
 from uem_dolfinx.parallel import reduced
@@ -331,8 +333,19 @@ class Inversions:
 
 
 def not_finite(bodies: Any, when: str, remedy: str) -> UEMError:
-    """The error for forces that are not finite: a cell is turned inside out, or there is a ``remedy`` for anything else (collective)."""
+    """The error for forces that are not finite: a flat cell, or one turned inside out, or ``remedy`` for anything else (collective)."""
+    if where := _flat_cell(bodies.config):
+        return MeshError(f"the cell of the mesh at {where} is flat, so that strains in it are not finite: mend the mesh")
     inversions = bodies.inversions
     if inversions is not None and (where := inversions.find() or inversions.find(vertices=True)) is not None:
         return InvertedElementError(f"the cell at {where} is turned inside out: take smaller load steps or a finer mesh there")
     return NotFiniteError(f"the residual is not finite {when}: {remedy}")
+
+
+def _flat_cell(config: Configuration) -> str:
+    """Position of the first cell without area or volume of the first rank with one; empty without any (collective)."""
+    cell, mesh = compat.cell_name(config.mesh), config.mesh
+    nodes = compat.geometry_dofs(mesh)[:, : len(forms.reference_topology(cell)[0])].astype(np.int64)
+    flat = np.flatnonzero(flat_cells(cell, 1, nodes, mesh.geometry.x))
+    found = described(mesh.geometry.x[nodes[flat[0]]].mean(axis=0)[: config.gdim]) if len(flat) else ""
+    return next(filter(None, config.comm.allgather(found)), "")

@@ -5,16 +5,21 @@ Rigid motions of bodies are checked before they move, by ``floating``; other fie
 
 from __future__ import annotations
 
+from typing import Any
+
+from mpi4py import MPI
+
 import numpy as np
 from petsc4py import PETSc
 
 from uem_dolfinx import compat, forms
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.errors import FloatingBodyError, InputError, PrecisionError
+from uem_dolfinx.arrays import Array
+from uem_dolfinx.errors import FloatingBodyError, InputError, PrecisionError, UEMError
 from uem_dolfinx.geometry.bodies import find_bodies, middle
 from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.parallel import reduced
-from uem_dolfinx.solve.bodies.bodies import Bodies
+from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.bodies.field_scales import ratio
 
 
@@ -46,6 +51,32 @@ def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
         f"nothing holds {what} on the body with its middle at {here}: it becomes {largest:.3g} there, and "
         f"{residual:.3g} of its source is not in equilibrium; give it a Dirichlet condition, or a term that depends on its value"
     )
+
+
+def explain(problem: Any, error: UEMError, stiffness: Array | None, mendable: bool) -> None:
+    """Add to the error of a failed step what may have caused it: an indefinite tangent, or a corner; the state is restored (collective).
+
+    ``stiffness``: see ``Watch.name_corner``. ``mendable``: whether a shorter step may avoid the error.
+    """
+    bodies, config = problem.bodies, problem.config
+    if not (mendable or isinstance(error, FloatingBodyError)) or not config.moves:
+        return
+    start = bodies.stiffness_at_start
+    try:
+        diagonal = (bodies.initial_stiffness() if start is None else start) * bodies.free[: config.n_owned]
+    except UEMError:
+        diagonal = np.zeros((config.n_owned, config.gdim))
+    largest = reduced(config.comm, float(np.abs(diagonal).max(initial=0.0)), op=MPI.MAX)
+    node, axis = (some[:1] for some in np.nonzero(diagonal < -FORCE_ROUNDING * largest))
+    offers = config.comm.allgather([f"{'xyz'[axis[0]]} at {config.describe(int(node[0]))}"] if len(node) else [])
+    if place := next(filter(None, offers), None):
+        error.amend(
+            f"the tangent of the bodies is indefinite: a displacement along {place[0]} alone is driven on, not resisted; check "
+            "the sign of F, and that moduli are positive",
+            instead=True,
+        )
+    elif mendable:
+        problem.watch.name_corner(stiffness, error)
 
 
 def refuse_bare(bodies: Bodies, P: Restriction, Q: Restriction, more: PETSc.Mat | None) -> None:

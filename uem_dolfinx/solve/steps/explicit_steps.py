@@ -219,6 +219,8 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     problem.set_load(dynamics.time)
     if not dynamics.accelerated:
         stepper.begin()
+    if dynamics.time >= end:
+        return
     length, before, pattern = control.nominal if resumed else _length(stepper, dt, end), touching(problem), stepper.pattern()
     control.begin(length)
     stepper.look()

@@ -189,4 +189,5 @@ def check_steps(problem: Any, checkpoint: Any) -> None:
     """
     given.kind("problem", problem, isinstance(problem, UnitedProblem), "a UnitedProblem")
     with agreed(problem.comm):
+        problem.config.refuse_moved()
         checks.check_checkpoint(checkpoint)

@@ -10,6 +10,8 @@ from dataclasses import replace
 from itertools import compress
 from typing import TYPE_CHECKING
 
+from mpi4py import MPI
+
 import numpy as np
 
 from uem_dolfinx import given
@@ -17,7 +19,7 @@ from uem_dolfinx.arrays import Array
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.dynamics.inertia import Dynamics
 from uem_dolfinx.dynamics.scheme import is_explicit
-from uem_dolfinx.errors import InputError, PrecisionError, SpaceError, StepAccuracyError, UEMError
+from uem_dolfinx.errors import InputError, NotFiniteError, PrecisionError, SpaceError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
 from uem_dolfinx.solve.problem import UnitedProblem
@@ -86,6 +88,7 @@ def time_steps(
     dynamics = problem.dynamics
     if dynamics is None:
         raise SpaceError("time steps need inertia: give the problem dynamics=Dynamics(mass), or use load_steps for statics")
+    _check_velocity(dynamics)
     chosen = is_explicit(dynamics) and dt is None
     with agreed(problem.comm):
         dt = dt if chosen else given.number("dt", dt, given.POSITIVE)
@@ -109,6 +112,13 @@ def time_steps(
         total = max(0, round((end - dynamics.time) / dt))
     shown = progress(steps, "time steps", total=total)
     return between_steps(problem.comm, problem.progress, shown, checkpoint, problem.declared)
+
+
+def _check_velocity(dynamics: Dynamics) -> None:
+    """NotFiniteError for a velocity that is not finite, as users may set it (collective)."""
+    # PETSc keeps norms, and does not see what NumPy writes
+    if not reduced(dynamics.config.comm, bool(np.isfinite(dynamics.velocity.x.array).all()), op=MPI.LAND):
+        raise NotFiniteError(f"the velocity at time {dynamics.time:.6g} contains NaN or infinity: set finite numbers")
 
 
 def _check_length(dynamics: Dynamics, dt: float, end: float) -> None:
