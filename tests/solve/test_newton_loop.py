@@ -63,7 +63,7 @@ class OneUnknown:
         return False
 
     def assemble_constraints(self, in_equilibrium):
-        R, rows = vector(self.F()), SimpleNamespace(reduce=lambda du: vector(10.0 * du.array_r[0]))
+        R, rows = vector(self.F()), SimpleNamespace(unknowns=lambda du: vector(10.0 * du.array_r[0]))
         return IterationState(rows, rows, R, R.norm(), 1.0, 0.0, 0.0, 0, False, True, True, self.in_contact)
 
     def linearise(self, state, iteration):

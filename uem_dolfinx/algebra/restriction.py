@@ -66,7 +66,7 @@ class Restriction:
         like: Restriction | None = None,
     ):
         self.space, self.equations, self.free, self.stacked = space, equations, free, stacked
-        self.comm, self._orthonormal = space.comm, like or self
+        self.comm, self._like = space.comm, like
         g, n = space.block, space.n_owned
         self._sizes = ((g * n, g * space.n_global),) * 2
         self._first = g * space.first
@@ -348,7 +348,7 @@ class Restriction:
 
     def unknowns(self, du: PETSc.Vec) -> PETSc.Vec:
         """The unknowns q of an increment ``P q``, by the orthonormal frames of the restriction that this one is ``like``."""
-        return self._orthonormal.reduce(du)
+        return (self if self._like is None else self._like).reduce(du)
 
     def transpose(self, F: PETSc.Vec) -> PETSc.Vec:
         """``P'F``."""

@@ -185,11 +185,13 @@ def _described(path: Path) -> tuple[list[tuple[float, int, dict[str, Item]]], tu
         topology, geometry = found.find("Topology"), found.find("Geometry")
         fields = {one.get("Name"): Item(one[0], one.get("Center") == "Node") for one in found.iter("Attribute")}
         steps.append((float(time), int(number), fields))  # type: ignore[arg-type]
-        grid = topology.get("TopologyType"), Item(topology[0]), Item(geometry[0])  # type: ignore[union-attr,index]
+        kind, cells, nodes = topology.get("TopologyType"), Item(topology[0]), Item(geometry[0])  # type: ignore[union-attr,index]
         for name, one in fields.items():
-            if one.width not in (1, 3, 9) or one.rows != grid[2 if one.nodal else 1].rows:
+            if one.width not in (1, 3, 9) or one.rows != (nodes if one.nodal else cells).rows:
                 raise ValueError(f"'{name}' has {one.rows} rows of {one.width} numbers")
-        OF_TOPOLOGY[grid[0]]
+        if kind not in OF_TOPOLOGY:
+            raise ValueError(f"cells of type '{kind}'")
+        grid = kind, cells, nodes
     if grid is not None and not (numbers := path.with_suffix(".bin")).exists():
         raise MissingFileError(f"{numbers} does not exist: expected it next to its .xdmf file, which describes it")
     return steps, grid  # type: ignore[return-value]

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 
 from uem_dolfinx.algebra.equations import UnitingEquations
-from uem_dolfinx.errors import LinearSolveError
+from uem_dolfinx.errors import InputError, LinearSolveError
 from uem_dolfinx.log import timed
 from uem_dolfinx.solve.bodies.far_apart import FarApart
 from uem_dolfinx.solve.rigid.floating import FloatingBodies
@@ -49,6 +49,8 @@ class LagrangeSystem(BodySystem):
 
     def __init__(self, bodies: Bodies, pairs: list[Interface], solver: UnitedSolver, **options: Any):
         super().__init__(bodies, pairs, solver, **options)
+        if any(pair.target.averaged and pair.discretisation.traits.sliding == "finite" for pair in pairs):
+            raise InputError("averaged normals do not go with multipliers, whose saddle point is symmetric: take facets' normals")
         # nothing holds what floats
         self.floating = FloatingBodies(bodies, [], None, FarApart(bodies.config, []))
         #: The saddle-point matrix of the last solve.
