@@ -177,7 +177,7 @@ DAMAGE = {
     "places": (".xdmf", lambda path: path.write_text(path.read_text().replace('Seek="', 'Seek="9999999')), "run.bin ends before"),
     "half": (".xdmf", lambda path: _cut(path, 300), "run.xdmf cannot be read (ParseError"),
     "widths": (".xdmf", lambda path: path.write_text(path.read_text().replace(' 3"', ' 4"')), "cannot be read (ValueError"),
-    "cells": (".xdmf", lambda path: path.write_text(path.read_text().replace("Triangle", "Rhombus")), "cannot be read (KeyError"),
+    "cells": (".xdmf", lambda path: path.write_text(path.read_text().replace("Triangle", "Rhombus")), "cells of type 'Rhombus'"),
     "columns": (".csv", lambda path: path.write_text("time,step\n0.5,1\n1.0\n"), "line 3 of"),
     "names": (".csv", lambda path: path.write_text("time,time\n0.5,1\n"), "two columns 'time'"),
     "letters": (".csv", lambda path: path.write_bytes(b"\xff\xfe\x00"), "run.csv cannot be read (UnicodeDecodeError"),
