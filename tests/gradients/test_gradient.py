@@ -313,7 +313,8 @@ def test_parameters_that_have_changed():
         before = np.array(values)
         values[entry] = 1.01 * values[entry] + 1e-3 * np.sin(np.arange(np.size(values[entry])).reshape(np.shape(values[entry])))
         for ask in (lambda: uem.gradient(problem, s.J, s.E), lambda: uem.tangent(problem, [(s.E, 1.0)])):
-            refused(uem.InputError, "not that of the present parameters", ask)
+            words = "nodes have moved in the mesh" if values is places else "not that of the present parameters"
+            refused(uem.InputError, words, ask)
         values[...] = before
     # a thousand times what rtol = 1e-13 leaves of the forces lies between these changes of the load
     loaded = np.array(s.load.value)
