@@ -87,7 +87,7 @@ class Limits:
         limit, slope = self._stuck(lam)
         rate = none = np.zeros(len(limit))
         if slides_otherwise(self.law):
-            sliding = self._asked("sliding", self.law.sliding, lam, self.speed)
+            sliding = self._returned("sliding", self.law.sliding, lam, self.speed)
             limit, slope, rate = (np.where(slips, new, old) for new, old in zip(sliding, (limit, slope, rate)))
             dt = 0.0 if self.duration is None else self.duration()
             rate = rate / dt if dt > 0.0 else none
@@ -106,11 +106,11 @@ class Limits:
             agree(comm, fault)
 
     def _stuck(self, lam: Array) -> tuple[Array, Array]:
-        limit, slope = self._asked("limit", self.law.limit, lam)
+        limit, slope = self._returned("limit", self.law.limit, lam)
         return limit, slope
 
-    def _asked(self, what: str, f: Callable[..., Any], lam: Array, *more: Array) -> tuple[Array, ...]:
-        """What a method of the law returns, ``(n,)`` each; zeros if it is the user's and wrong, which ranks learn in ``agree``.
+    def _returned(self, what: str, f: Callable[..., Any], lam: Array, *more: Array) -> tuple[Array, ...]:
+        """What a method of the law returns, ``(n,)`` each; zeros if it is the user's and wrong, an error that ``agree`` raises.
 
         Ranks call it at different times, so that it is not collective.
         """

@@ -228,7 +228,7 @@ def curvature_of(
 
 
 def _curvature(pair: Interface, state: PairState, apart: bool, convex: bool) -> list[tuple[Ints, Array]]:
-    """See ``Interface.curvature``; of averaged normals that turn with further nodes only the symmetric part, if asked for (collective)."""
+    """See ``Interface.curvature``; with averaged normals the symmetric part alone where P and Q are equal, or ``convex`` (collective)."""
     parts = pair.curvature(state)
     if not pair.target.averaged or (apart and not convex):
         return parts
