@@ -186,4 +186,5 @@ def test_a_contact_that_is_declared_twice(coupling):
         ends.append(np.array(b.u.x.array))
         forces.append(sum(np.array(one.resultant().force) for one in contacts))
     np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(forces[1], forces[0], rtol=0, atol=1e-14)
+    # differences of reactions of stiffness 1 at displacements of 0.01
+    np.testing.assert_allclose(forces[1], forces[0], rtol=0, atol=1e-12)
