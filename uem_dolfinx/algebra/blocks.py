@@ -37,26 +37,28 @@ def together(*parts: Blocks) -> Blocks:
     return Blocks(*map(np.concatenate, zip(*parts)))
 
 
-def product(A: Blocks, B: Blocks) -> Blocks:
-    """``A B`` without duplicates, zeros stored; columns of A without a row in B count as zero."""
+def product(*factors: Blocks) -> Blocks:
+    """Product of matrices without duplicates, zeros stored; columns of a factor without a row in the next one count as zero."""
     from scipy.sparse import bsr_matrix
 
-    g = A.value.shape[1]
-    inner, of_inner = np.unique(B.row, return_inverse=True)
-    at = inner.searchsorted(A.column)
-    kept = np.append(inner, -1)[at] == A.column
-    rows, of_row = np.unique(A.row[kept], return_inverse=True)
-    columns, of_column = np.unique(B.column, return_inverse=True)
-    if not len(rows):
-        return Blocks(rows, rows, np.zeros((0, g, g)))
+    *others, last = factors
+    g = last.value.shape[1]
+    rows, of_row = np.unique(last.row, return_inverse=True)
+    columns, of_column = np.unique(last.column, return_inverse=True)
     # for blocks of single numbers SciPy drops zeros, so that the sparsity would depend on values
-    wide = np.zeros((len(B.row), g, max(g, 2)))
-    wide[:, :, :g] = B.value
-    left = in_rows(of_row, at[kept], A.value[kept], len(rows))
-    right = in_rows(of_inner, of_column, wide, len(inner))
-    C = bsr_matrix(left, shape=(g * len(rows), g * len(inner))) @ bsr_matrix(
-        right, shape=(g * len(inner), wide.shape[2] * len(columns))
-    )
+    wide = np.zeros((len(last.row), g, max(g, 2)))
+    wide[:, :, :g] = last.value
+    shape = g * len(rows), wide.shape[2] * len(columns)
+    C: Any = bsr_matrix(in_rows(of_row, of_column, wide, len(rows)), shape=shape) if len(rows) else None
+    for A in reversed(others):
+        at = rows.searchsorted(A.column)
+        kept = np.append(rows, -1)[at] == A.column
+        inner, (rows, of_row) = len(rows), np.unique(A.row[kept], return_inverse=True)
+        if not len(rows):
+            return Blocks(rows, rows, np.zeros((0, g, g)))
+        left = in_rows(of_row, at[kept], A.value[kept], len(rows))
+        C = bsr_matrix(left, shape=(g * len(rows), g * inner)) @ C
+    C.sort_indices()
     return Blocks(np.repeat(rows, np.diff(C.indptr)), columns[C.indices], C.data[:, :, :g])
 
 

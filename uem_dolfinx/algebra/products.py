@@ -157,10 +157,12 @@ class UnitedMatrix(Returning):
         near = self._inside(np.setdiff1d(rows.column[inside], own) - first, eliminated)
         others = self._outside(among(self._beyond.column, seen) & ~eliminated[self._beyond.row - first])
         left = together(rows, near, others, *([] if G is None else [G]))
-        on = among(left.column, seen)
-        X = together(left.some(~on), product(left.some(on), trial))
-        at = eliminated[X.row - first]
-        changes = summed(together(X.some(~at), to_owners(space, product(test.transposed, X.some(at)))))
+        # rows and columns that are not eliminated stay as they are
+        trial = together(trial, _ones(np.setdiff1d(left.column, seen), space.block))
+        test = together(test.transposed, _ones(np.setdiff1d(left.row, own), space.block))
+        changes = product(test, left, trial)
+        if space.comm.size > 1:
+            changes = summed(to_owners(space, changes))
         return changes, ~(eliminated[changes.row - first] | among(changes.column, seen))
 
     def _handed_on(self, trial: Blocks, coupled: Blocks) -> Blocks:
@@ -309,6 +311,11 @@ class UnitedMatrix(Returning):
         held = np.flatnonzero(~self._made_for[1])
         #: Positions of the diagonal entries of prescribed components, in K and in the matrix.
         self._held = tuple(entries.find(held, held + self._first)[0] for entries in (K, self._A))
+
+
+def _ones(nodes: Ints, g: int) -> Blocks:
+    """Rows of the identity at ``nodes (k,)``."""
+    return Blocks(nodes, nodes, np.broadcast_to(np.eye(g), (len(nodes), g, g)))
 
 
 def _lines(places: Ints, width: Ints, g: int) -> Ints:

@@ -219,11 +219,11 @@ class Restriction:
         turned = self._halo.take(lambda i: self._turned(i).value)
         terms, power = [T], Blocks(M.row, M.column, M.value @ turned[self._term])
         while True:
+            if self.fades:
+                power = power.some((np.abs(power.value) > FADED).any(axis=(1, 2)))
             terms.append(power)
             if len(terms) > self.chain:
                 return summed(together(*terms))
-            if self.fades:
-                power = power.some((np.abs(power.value) > FADED).any(axis=(1, 2)))
             power = product(M, rows_at(self.space, power, self._follows))
 
     def rows_of(self, nodes: npt.NDArray[np.integer]) -> Blocks:
