@@ -16,7 +16,7 @@ def state_of(problem: Any) -> State:
     """Functions and numbers of a problem, from which its run continues as if uninterrupted (collective)."""
     stiffness, own, config = fem.Function(problem.config.V), problem.config.functions(), problem.config
     starts = {name: fem.Function(f.function_space) for name, f in own.items()}
-    of_equations, known_at = fem.Function(config.V), fem.Function(config.V)
+    of_equations = fem.Function(config.V)
     functions = own | {"stiffness": stiffness}
     carried = {name: fem.Function(f.function_space) for name, f in own.items()}
     for i, pair in enumerate(problem.pairs, 1):
@@ -33,7 +33,7 @@ def state_of(problem: Any) -> State:
         if d.damping is not None:
             functions["velocity in damping"] = d.past
         if is_explicit(d):
-            functions["displacement at the critical step"] = known_at
+            functions["displacement at the critical step"] = problem.step_control.known_at
     for i, material in enumerate(problem.materials, 1):
         functions |= {f"{name} {i}": f for name, f in material.history.items()}
     if problem.linear is not None:
@@ -63,8 +63,6 @@ def state_of(problem: Any) -> State:
             of_equations.x.scatter_forward()
         if problem.dynamics is not None:
             state.numbers |= problem.dynamics.to_checkpoint() | problem.step_control.to_checkpoint()
-            if len(at := problem.step_control.known_at):
-                known_at.x.array[:] = at
         if problem.linear is not None and problem.linear.turns:
             state.numbers["turns of couplings"] = problem.linear.turns
 
@@ -85,8 +83,6 @@ def state_of(problem: Any) -> State:
         if problem.dynamics is not None:
             problem.dynamics.from_checkpoint(state.numbers)
             problem.step_control.from_checkpoint(state.numbers)
-            if is_explicit(problem.dynamics):
-                problem.step_control.known_at = np.array(known_at.x.array)
         at = problem.progress.factor if problem.dynamics is None else problem.dynamics.time
         for contact in problem.contacts:
             contact.take_load(at, known=True)

@@ -30,7 +30,7 @@ from uem_dolfinx.solve import checks
 from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.field_scales import Norm
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, reactions, refuse_idle, set_loads, taken_by, values_at
-from uem_dolfinx.solve.step_control import MENDABLE, StepControl
+from uem_dolfinx.solve.step_control import MENDABLE, control_of
 from uem_dolfinx.solve.stepping import Progress
 from uem_dolfinx.solve.united.newton import ContactMethod, Iteration, solve_united
 from uem_dolfinx.solve.united.system import BodySystem
@@ -219,7 +219,7 @@ class UnitedProblem(given.Sealed):
         options |= {} if self.linear is None else {"linear": self.linear}
         self.stage: Any = None  # the present ``solve.steps.stages.Stage``
         self.system = method(self.bodies, self.interfaces, self.solver, **options)
-        self.step_control = StepControl()  #: Length of time steps, with the history needed to control it.
+        self.step_control = control_of(dynamics, self.config.V)  #: Length of time steps, with the history needed to control it.
         self.progress = Progress()  # in steps and in load
         self.committed = np.array(u.x.array)  # displacement of the last converged state ``(n_local incl. ghosts,)``
         #: Motions of the rigid targets in that state; None for targets that had not moved, and for meshes.

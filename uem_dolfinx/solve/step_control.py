@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from dolfinx import fem
 
 from uem_dolfinx import errors
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.dynamics.scheme import MOST_GIVEN, SHORTEST_GIVEN, is_explicit
 from uem_dolfinx.log import logger
 
 #: A step may be cut to this part of its nominal length.
@@ -44,18 +46,11 @@ class StepControl:
         largest_energy: largest kinetic energy of the bodies in checks of the energy added by contacts.
         largest_speed: largest speed of the bodies in estimates of errors in time, a root of an energy.
         accurate: longest step that errors of the last ones in time let expect to be accurate.
-        due: number of the step after which explicit steps look at how fast cells are strained.
-        known_at: displacement where the critical step was last found, from where strains count, ghosts included ``(n,)``.
-        resolved: bound on the length of explicit steps that resolve contacts on a stiff surface.
-        of_contact: whether contacts change the critical step of explicit steps.
-        shortest: height of a cell when explicit steps last looked at them, a length.
     """
 
     def __init__(self, nominal: float = 1.0):
         self.nominal, self.longest, self.number, self.largest_energy, self.largest_speed = nominal, np.inf, 0, 0.0, 0.0
-        self._cuts, self._read, self._longest_before, self.due, self.resolved = 0, False, np.inf, 0, np.inf
-        self.of_contact, self.shortest, self.accurate = False, np.inf, np.inf
-        self.known_at: Array = np.zeros(0)
+        self._cuts, self._read, self._longest_before, self.accurate = 0, False, np.inf, np.inf
         self._failed: list[object] = []  # history of the last attempt of this step, which failed
 
     def begin(self, nominal: float) -> None:
@@ -109,8 +104,6 @@ class StepControl:
             kinetic: returns the kinetic energy of the bodies.
             held: returns other energy at work.
         """
-        from uem_dolfinx.dynamics.scheme import MOST_GIVEN
-
         if given <= MOST_GIVEN * self.largest_energy:
             return None
         self.largest_energy = max(self.largest_energy, kinetic())
@@ -120,8 +113,6 @@ class StepControl:
 
     def refuse_energy(self, words: str, length: float, again: bool = False) -> None:
         """Refuse a step in which contacts give too much energy, or warn of it where the step is short and not better ``again``."""
-        from uem_dolfinx.dynamics.scheme import SHORTEST_GIVEN
-
         if length > SHORTEST_GIVEN * self.nominal or again:
             raise errors.EnergyGivenError(words)
         logger.warning("%s, and shorter steps are no better: refine the meshes of the surfaces that touch", words)
@@ -147,10 +138,58 @@ class StepControl:
     def to_checkpoint(self) -> dict[str, Any]:
         """Numbers for a checkpoint, by name."""
         kept = {"steps done": self.number, "longest step": self.longest, "largest energy": self.largest_energy}
-        return kept | {
-            "nominal length": self.nominal,
-            "largest speed": self.largest_speed,
-            "accurate step": self.accurate,
+        return kept | {"nominal length": self.nominal, "largest speed": self.largest_speed, "accurate step": self.accurate}
+
+    def from_checkpoint(self, kept: dict[str, Any]) -> None:
+        """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
+        # files of earlier versions lack these
+        kept = {"largest speed": 0.0, "accurate step": np.inf} | kept
+        self.number, self.longest, self.largest_energy = (kept[name] for name in ("steps done", "longest step", "largest energy"))
+        self.nominal, self.largest_speed, self.accurate = (
+            kept[name] for name in ("nominal length", "largest speed", "accurate step")
+        )
+        self._read, self._longest_before = True, self.longest
+
+
+class ExplicitControl(StepControl):
+    """Length of explicit steps, with what is known of the critical step and of the cells.
+
+    Args:
+        V: space of the displacement.
+
+    Attributes:
+        due: number of the step after which the stepper looks at how fast cells are strained.
+        known_at: displacement where the critical step was last found, from where strains count.
+        resolved: bound on the length of steps that resolve contacts on a stiff surface.
+        of_contact: whether contacts change the critical step.
+        shortest: height of a cell when the stepper last looked at them, a length.
+    """
+
+    def __init__(self, V: fem.FunctionSpace):
+        super().__init__()
+        self.known_at = fem.Function(V)
+        self.due, self.resolved, self.of_contact, self.shortest = 0, np.inf, False, np.inf
+
+    def know(self, displacement: Array) -> None:
+        """Note that the critical step is known at this displacement, ghosts included ``(n,)``."""
+        self.known_at.x.array[:] = displacement
+
+    def depend(self, of_contact: bool) -> None:
+        """Note whether contacts change the critical step."""
+        self.of_contact = of_contact
+
+    def resolve(self, length: float) -> float:
+        """Lower the bound that resolves contacts to this length, if it is less; returns the bound."""
+        self.resolved = min(self.resolved, length)
+        return self.resolved
+
+    def looked(self, shortest: float, steps: int = 1) -> None:
+        """Note the least height of the cells, and that the next look is due after so many steps, at least one."""
+        self.shortest, self.due = shortest, self.number + max(steps, 1)
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Numbers for a checkpoint, by name."""
+        return super().to_checkpoint() | {
             "critical step due": self.due,
             "resolved step": self.resolved,
             "steps of contact": self.of_contact,
@@ -159,14 +198,11 @@ class StepControl:
 
     def from_checkpoint(self, kept: dict[str, Any]) -> None:
         """Restore the numbers of ``to_checkpoint``; other numbers are ignored."""
-        # files of earlier versions lack these
-        kept = {
-            "largest speed": 0.0, "accurate step": np.inf, "critical step due": 0, "resolved step": np.inf,
-            "least height": np.inf,
-        } | kept  # fmt: skip
-        kept.setdefault("steps of contact", False)
-        (
-            self.number, self.longest, self.largest_energy, self.nominal, self.largest_speed, self.accurate, self.due,
-            self.resolved, self.of_contact, self.shortest,
-        ) = (kept[name] for name in self.to_checkpoint())  # fmt: skip
-        self._read, self._longest_before = True, self.longest
+        super().from_checkpoint(kept)
+        self.due, self.resolved = kept["critical step due"], kept["resolved step"]
+        self.of_contact, self.shortest = kept["steps of contact"], kept["least height"]
+
+
+def control_of(dynamics: Any, V: fem.FunctionSpace) -> StepControl:
+    """Control of the steps of a problem with these dynamics, or None, and a displacement in ``V``."""
+    return ExplicitControl(V) if is_explicit(dynamics) else StepControl()

@@ -63,6 +63,11 @@ class PartSolver(UnitedSolver):
         with timed("united matrix of explicit steps"):
             self._unite(P, Q, K, G)
 
+    def begin_step(self) -> None:
+        """Let no factorisation of an earlier step serve, which a run continued from a checkpoint does not have."""
+        super().begin_step()
+        self._alike = None
+
     def take(self, solved: Any, P: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, Q: Restriction) -> None:
         """As ``set_operator``: a factorisation costs no more than it saves (collective)."""
         self.set_operator(P, K, G, Q)

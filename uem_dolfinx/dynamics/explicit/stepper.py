@@ -260,7 +260,8 @@ class ExplicitStepper:
         stiff = fixed > STIFF_SURFACE * condensed
         # closed contacts leave nothing of the surface that could be at rest
         closed = control.of_contact and reduced(problem.comm, int(any(pair.united.any() for pair in problem.interfaces))) > 0
-        control.of_contact, self.part = stiff or closed, RESOLVED if closed else 1.0
+        control.depend(stiff or closed)
+        self.part = RESOLVED if closed else 1.0
         return condensed if stiff else fixed
 
     def _nodal(self, of: Any) -> Array:
@@ -274,7 +275,8 @@ class ExplicitStepper:
 
     def count_from(self, displacement: Array) -> None:
         """Let strains count from this displacement on, ghosts included ``(n,)``: the critical step is known there."""
-        config, self.problem.step_control.known_at = self.problem.config, displacement
+        self.problem.step_control.know(displacement)
+        config = self.problem.config
         x = (config.X + config.of(displacement)).T
         self._since = [self._slopes(x, cells).astype(np.float32) for cells in self._blocks]
 

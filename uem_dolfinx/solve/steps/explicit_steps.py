@@ -225,11 +225,11 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     control.begin(length)
     stepper.look()
     if resumed:
-        stepper.count_from(control.known_at)
+        stepper.count_from(control.known_at.x.array)
         stepper.shortest = control.shortest
     else:
         # bodies that touch deform from the first step on
-        control.due, control.shortest = control.number + 1, stepper.shortest
+        control.looked(stepper.shortest)
     while (remainder := end - dynamics.time) > LEFT * length:
         taken = min(length if remainder >= (1.0 - LEFT) * length else remainder, control.longest)
         try:
@@ -254,12 +254,11 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         before, found = after, (pattern := stepper.pattern()) != last
         if due or found:
             stepper.look()
-            control.shortest = stepper.shortest
             anew = end - dynamics.time > LEFT * length and (found or not stepper.steps_to_look(length))
             if anew:
                 length = _length(stepper, dt, end)
                 control.begin(length)
-            control.due = number + max(stepper.steps_to_look(length, anew), 1)
+            control.looked(stepper.shortest, stepper.steps_to_look(length, anew))
         # a checkpoint holds what the next step begins with
         yield done
 
@@ -281,9 +280,8 @@ def _length(stepper: ExplicitStepper, dt: float | None, end: float) -> float:
             )
         return dt
     longest, control = dynamics.scheme.safety * critical, stepper.problem.step_control
-    if stepper.part < 1.0:
-        control.resolved = min(control.resolved, stepper.part * longest)
-    longest = min(longest, control.resolved, steady)
+    resolved = control.resolve(stepper.part * longest if stepper.part < 1.0 else np.inf)
+    longest = min(longest, resolved, steady)
     remainder = end - dynamics.time
     # the same on any ranks: rounding of the critical step does not change the number of steps
     length = remainder / max(np.ceil(remainder / longest - LEFT), 1.0)
