@@ -10,6 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
+from benchmarks import cases, cases_touching
 from block_scenes import arch, blocks, st_venant
 from helpers import clamp, modulus
 
@@ -96,3 +97,11 @@ def test_nothing_rests_on_a_slope():
     with pytest.raises(FloatingBodyError, match="no contact stops it"):
         list(uem.load_steps(problem, 1))
     assert not problem.u.x.array.any() and problem.bodies.tangent.points is None and problem.system.floating.motions is not None
+
+
+@pytest.mark.slow
+def test_a_body_that_rocks():
+    """A round body falls askew and rests on a contactor in a corner between two facets, which holds it both ways across."""
+    trial = cases.Trial(cases.COLUMNS[0])
+    cases_touching.rocking(trial)
+    assert trial.checks and max(check.severity for check in trial.checks) <= 1.0

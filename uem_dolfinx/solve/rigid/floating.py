@@ -21,7 +21,7 @@ from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface, in_question
 from uem_dolfinx.contact.seam.active_set import TOUCHING
-from uem_dolfinx.contact.seam.placement import ContactRows
+from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows
 from uem_dolfinx.errors import FloatingBodyError
 from uem_dolfinx.form_checks import takes_values
 from uem_dolfinx.log import logger
@@ -304,8 +304,8 @@ class FloatingBodies:
         equations = [pair.equations() for pair in pairs]
         more = [] if self._linear is None else [self._linear.at_present(), *self._linear.sprung()]
         rows = UnitingEquations.join([*(_of_held(pair, e) for pair, e in zip(pairs, equations)), *more], g)
-        # sticking contactors are held in all directions; contactors without friction may separate again
-        firm = [(e.permanent | (pair.friction is not None))[e.resisting.active] for pair, e in zip(pairs, equations)]
+        # sticking contactors are held in all directions, those in corners both ways across; others without friction may separate again
+        firm = [((e.kind != NORMAL) | (pair.friction is not None))[e.resisting.active] for pair, e in zip(pairs, equations)]
         which = np.concatenate([np.zeros(0, bool), *firm, *(np.ones(len(e), bool) for e in more)])
         rates = motions.rates(rows)
         return _Held(rows, rates, which, motions.open_motions(rates[which]))
