@@ -277,11 +277,12 @@ class Condensed(Returning):
         self._known = (du.copy(), forces.copy()) if exact else None
         return forces
 
-    def complete(self, dq: PETSc.Vec, needed: Sequence[Indices] | None = None) -> PETSc.Vec:
-        """Unknowns dq of the last solve, on I as well; if owned nodes are given as ``needed``, only if one is not in C (collective)."""
+    def complete(self, dq: PETSc.Vec, needed: Callable[[], Sequence[Indices] | None] | None = None) -> PETSc.Vec:
+        """Unknowns dq of the last solve, on I as well; only if one of the owned nodes that ``needed`` returns is not in C (collective)."""
         if self.whole:
             return dq
-        if needed is not None and not reduced(self.space.comm, int(any(not self._nodes[nodes].all() for nodes in needed))):
+        some = None if needed is None else needed()
+        if some is not None and not reduced(self.space.comm, int(any(not self._nodes[nodes].all() for nodes in some))):
             return dq
         assert self._known is not None
         (P, _, K, _), at = self.made_of, self._at

@@ -387,7 +387,7 @@ class UnitedSolver(KspOfOptions):
         self.condensed.begin_at(c, rounding)
 
     def complete(self, dq: PETSc.Vec, needed: Any = None) -> PETSc.Vec:
-        """All unknowns of the last solve; with nodes ``needed``, completed only if one of these is missing (collective)."""
+        """All unknowns of the last solve; completed only if one of the nodes that ``needed`` returns is missing (collective)."""
         return self.condensed.complete(dq, needed) if self._on_condensed else dq
 
     def _iterate(self, rhs: PETSc.Vec, dq: PETSc.Vec) -> bool:

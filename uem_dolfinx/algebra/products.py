@@ -204,10 +204,9 @@ class UnitedMatrix(Returning):
 
     def _crossed_out(self, G: PETSc.Mat, free: Bools) -> Blocks:
         """Blocks of G in owned rows without prescribed components (collective)."""
-        row, column, value = blocks_of_matrix(self.space, G)
-        distinct, at = np.unique(column, return_inverse=True)
-        there = self.space.ask_owners(distinct, free.astype(float))[at]
-        return Blocks(row, column, value * free[row - self.space.first][:, :, None] * there[:, None, :])
+        crossed, kept = G.copy(), self.space.vector(free)
+        crossed.diagonalScale(kept, kept)
+        return blocks_of_matrix(self.space, crossed)
 
     def _find(self, entries: Entries, blocks: Blocks) -> tuple[Ints, Bools]:
         """Positions of the lines of blocks in owned rows ``(k, g)``, and whether the blocks exist ``(k,)``."""

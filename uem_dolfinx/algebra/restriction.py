@@ -99,8 +99,8 @@ class Restriction:
         """Set the equations, with known eliminated components, and the increments d that close their gaps (collective)."""
         self.equations = equations
         self.d = self._closing(prescribed, equations.gap)
-        #: Active equations, whose terms form M, and the nodes that they follow.
-        self._held = equations.select(equations.active)
+        #: Active equations, whose terms form M, their part of L, and the nodes that they follow.
+        self._held, self._lift = equations.select(equations.active), self.lift[equations.active]
         self._follows, self._term = np.unique(self._held.followed, return_inverse=True)
         self._halo = Halo(self.space, self._follows) if self._n_terms else None
 
@@ -214,7 +214,7 @@ class Restriction:
         if self.chain == 0:
             return T
         assert self._halo is not None
-        M = self._couplings(self.equations.active)
+        M = self._couplings(self._held, self._lift)
         # T is block-diagonal
         turned = self._halo.take(lambda i: self._turned(i).value)
         terms, power = [T], Blocks(M.row, M.column, M.value @ turned[self._term])
@@ -232,7 +232,7 @@ class Restriction:
 
     def reserved(self) -> Blocks:
         """Sparsity of ``rows`` if all equations were active, without chains."""
-        return together(self._turned(self.nodes), self._couplings(np.ones_like(self.equations.active)))
+        return together(self._turned(self.nodes), self._couplings(self.equations, self.lift))
 
     @property
     def followed_here(self) -> Ints:
@@ -254,11 +254,10 @@ class Restriction:
         numbers = nodes + self.space.first
         return Blocks(numbers.astype(np.int64), numbers.astype(np.int64), value)
 
-    def _couplings(self, which: Bools) -> Blocks:
-        """M for some equations."""
-        eq = self.equations.select(which)
+    def _couplings(self, eq: UnitingEquations, lift: Array) -> Blocks:
+        """M for some equations, with their part of L."""
         rows = eq.node[eq.row] + self.space.first
-        return Blocks(rows.astype(np.int64), eq.followed, self.lift[which][eq.row][:, :, None] * eq.coefficients[:, None, :])
+        return Blocks(rows.astype(np.int64), eq.followed, lift[eq.row][:, :, None] * eq.coefficients[:, None, :])
 
     @cached_property
     def P(self) -> PETSc.Mat:
@@ -333,7 +332,7 @@ class Restriction:
         part = F.array_r.reshape(-1, self.space.block)
         total, eq = part.copy(), self._held
         for _ in range(self.chain):
-            along = np.einsum("mg,mg->m", self.lift[self.equations.active], part[eq.node])
+            along = np.einsum("mg,mg->m", self._lift, part[eq.node])
             assert self._halo is not None
             part = self._halo.add(sums_of_rows(self._term, eq.coefficients * along[eq.row][:, None], len(self._follows)))
             total += part
@@ -371,12 +370,12 @@ class Restriction:
         if not self.chain:
             return v
         part = v.array_r.reshape(-1, self.space.block)
-        total, eq, lift = part.copy(), self._held, self.lift[self.equations.active]
+        total, eq = part.copy(), self._held
         for _ in range(self.chain):
             assert self._halo is not None
             there = self._halo.take(part.__getitem__)[self._term]
             along = np.bincount(eq.row, np.einsum("kg,kg->k", eq.coefficients, there), len(eq))
-            part = sums_of_rows(eq.node.astype(np.int64), lift * along[:, None], self.space.n_owned)
+            part = sums_of_rows(eq.node.astype(np.int64), self._lift * along[:, None], self.space.n_owned)
             total += part
         return self.space.vector(total)
 

@@ -31,6 +31,7 @@ class FacetData:
 
     x: Array  # current positions of their nodes ``(m, nn, gdim)``
     nodes: Ints  # global block numbers of the nodes ``(m, nn)``
+    area_vectors: Array  # outward, with the facet's area as length, at the nodes ``(m, nn, gdim)``
     nodal_normals: Array  # averaged outward unit normals there ``(m, nn, gdim)``
     #: sums of the outward unit normals of the facets around each corner, weighted with the angle of the facet
     #: there ``(m, n_corners, gdim)``. If the closest point is a corner, they decide whether the point is outside (Baerentzen
@@ -169,13 +170,14 @@ class TargetFacets:
             self._placed = self._placed_at(x)
         if corners and self._placed.corner_normals is None:
             angles = self.shape.corner_angles(x)
-            unit_vectors = unit(self._area_vectors(x)[:, : angles.shape[1]])
+            unit_vectors = unit(self._placed.area_vectors[:, : angles.shape[1]])
             self._placed = replace(self._placed, corner_normals=self._summed(angles[:, :, None] * unit_vectors))
         return self._placed
 
     def _placed_at(self, x: Array) -> FacetData:
         """Facets with nodes at ``x (m, nn, gdim)``; nodal normals are averages weighted with areas, without angles (collective)."""
-        return FacetData(x, self.nodes, unit(self._summed(self._area_vectors(x))))
+        vectors = self._area_vectors(x)
+        return FacetData(x, self.nodes, vectors, unit(self._summed(vectors)))
 
     def _summed(self, vectors: Array) -> Array:
         """Nodal sums over all facets of ``vectors (m, k, gdim)`` at the facets' first k nodes, returned for each facet (collective)."""

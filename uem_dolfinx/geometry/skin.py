@@ -151,7 +151,7 @@ class Skin(TargetFacets):
         """See ``TargetFacets``; at sharp edges, normals are averaged only over facets of one face (collective)."""
         data = super()._placed_at(x)
         normals = data.nodal_normals.copy()
-        there, sums = self._of_one_face(self._area_vectors(x))
+        there, sums = self._of_one_face(data.area_vectors)
         normals[there] = unit(sums)
         self._spread = None
         return replace(data, nodal_normals=normals)

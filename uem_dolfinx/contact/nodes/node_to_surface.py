@@ -47,7 +47,7 @@ class NodeToSurface(OnTarget):
     traits = Traits(at_feet=True, pointwise=True, chained=False, two_pass=True)
     #: Whether an end of the target holds contactors that first touch there, for all or for each ``(n,)``.
     ends_hold: bool | Bools = True
-    _edges: Any = None  # in place of ``ConcaveEdges``, see ``follow_by``
+    _edges: Any = None  # ``ConcaveEdges``, once they are needed, or another object, see ``follow_by``
 
     def __init__(self, config: Configuration, nodes: Indices, target: Target, *, chords: bool = False, **how: Any):
         super().__init__(config, nodes, target, **how)
@@ -64,11 +64,11 @@ class NodeToSurface(OnTarget):
         """Tracking of contactors from facet to facet; None for targets with continuous normals."""
         if self.sliding != "finite" or not self.target.faceted:
             return None
-        if self._edges is not None:
-            return self._edges
-        from uem_dolfinx.contact.nodes.concave_edges import ConcaveEdges
+        if self._edges is None:
+            from uem_dolfinx.contact.nodes.concave_edges import ConcaveEdges
 
-        return ConcaveEdges(self)
+            self._edges = ConcaveEdges(self)
+        return self._edges
 
     def follow_by(self, edges: Any) -> None:
         """Track contactors by another object than ``ConcaveEdges``, with its methods; ends hold all of them."""

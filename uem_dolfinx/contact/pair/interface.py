@@ -386,7 +386,7 @@ class Interface:
     @property
     def united(self) -> Bools:
         """Contactors that are active or tied ``(n,)``."""
-        return self.trial.active | self.tied
+        return self.trial.active if self.tie is None else self.trial.active | self.tie.tied
 
     def displaced(self) -> float:
         """Norm of the forces that gaps would make by a displacement of the size of positions; 0 without stiffness (collective)."""

@@ -156,10 +156,8 @@ class ArcLength:
     def exchange(self, problem: LinearisedProblem, step: Increment) -> IterationState | None:
         """The state with a changed active set, as predicted under the new load; see ``ContactMethod``."""
         assert isinstance(problem.state, BodyState)
-        held = self._change * self._slope
-        if problem.state.held is not None:
-            held.axpy(1.0, problem.state.held)
-        return self._system.exchange(problem._replace(state=replace(problem.state, held=held)), step)
+        forces = problem.state.forces + self._change * self._slope
+        return self._system.exchange(problem._replace(state=replace(problem.state, forces=forces)), step)
 
 
 class AlongArc:

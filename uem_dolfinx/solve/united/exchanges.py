@@ -6,7 +6,7 @@ A repeated state is detected, and another rule is then used. If no rule is left,
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -20,9 +20,11 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.pair.tables import label_of, name_at
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Pivoting, Rule, Violations
+from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.errors import ConvergenceError, FrictionError
 from uem_dolfinx.parallel import gathered, reduced
+from uem_dolfinx.solve.bodies.bodies import Bodies
 from uem_dolfinx.solve.rigid.first_touch import deepest_of
 
 if TYPE_CHECKING:
@@ -88,7 +90,7 @@ class Exchanges:
     def begin_step(self) -> None:
         """Forget the states of other steps."""
         self._visits: list[_Visit] = []
-        self._rounds = 0
+        self._rounds, self._cohesive = 0, any(pair.trial.cohesion is not None for pair in self._pairs)
         #: Whether the curvature is convex, and the residual norm at which it became so; zero to set it at the next visit.
         self.convex, self._from = False, 0.0
         #: Norm of the last residual, and of the last one at which contactors stayed that would have let bodies jump.
@@ -98,7 +100,7 @@ class Exchanges:
     @property
     def softens(self) -> bool:
         """Whether contacts soften, and bodies need not follow an unstable path: without softening their energy falls in any case."""
-        return self.may_jump and any([pair.trial.cohesion is not None for pair in self._pairs])
+        return self.may_jump and self._cohesive
 
     @property
     def jumps(self) -> bool:
@@ -179,7 +181,7 @@ class Exchanges:
             return [w.among(np.zeros_like(w.enter)) for w in violated]
         both = zip(violated, self._pairs)
         own = np.sum([(w.count, w.enter.sum(), pair.trial.active.sum(), len(pair.nodes)) for w, pair in both], axis=0)
-        sums = gathered(comm, np.array([*own, self._pattern()], dtype=np.int64))
+        sums = gathered(comm, np.array([*own, _fingerprint([_pattern(pair.trial) for pair in self._pairs])], dtype=np.int64))
         (number, entering, active, every), state = sums[:, :4].sum(axis=0), tuple(sums[:, 4])
         self._before = None if entering else [pair.trial for pair in self._pairs]
         if not number:
@@ -244,7 +246,9 @@ class Exchanges:
             self.convex = norm > WHOLE_AGAIN * self._from
         if not self.convex:
             self._from = 0.0
-        here = _Visit(self._state(), norm, [_pattern(pair.trial) for pair in self._pairs], self._changed)
+        patterns = [_pattern(pair.trial) for pair in self._pairs]
+        state = tuple(gathered(self._pairs[0].config.comm, _fingerprint(patterns)))
+        here = _Visit(state, norm, patterns, self._changed)
         back = [k for k, v in enumerate(self._visits) if v.state == here.state and norm > NO_LESS * v.norm > 0.0]
         self._visits.append(here)
         if not back:
@@ -269,14 +273,6 @@ class Exchanges:
             raise self._circle(changed)
         return bool(calm.any())
 
-    def _state(self) -> tuple[int, ...]:
-        """Fingerprint of the present states of all contactors."""
-        return tuple(gathered(self._pairs[0].config.comm, self._pattern()))
-
-    def _pattern(self) -> int:
-        """Fingerprint of the present states of this rank's contactors."""
-        return zlib.crc32(b"".join([_pattern(pair.trial).tobytes() for pair in self._pairs]))
-
     def _circle(self, changed: Sequence[Bools]) -> ConvergenceError:
         """The error for a cycle, with the names of contactors, marked in masks ``(n,)`` of every pair."""
         own = [
@@ -300,6 +296,11 @@ def _pattern(t: PairState) -> Ints:
     return np.concatenate([t.active[:, None], t.held, *along], axis=1, dtype=np.int64, casting="unsafe")
 
 
+def _fingerprint(patterns: Sequence[Ints]) -> int:
+    """Fingerprint of the states of this rank's contactors, from the patterns of all pairs."""
+    return zlib.crc32(b"".join([pattern.tobytes() for pattern in patterns]))
+
+
 def _calm(pair: Interface, which: Bools) -> bool:
     """Set averaged normals in this step for contactors of ``which (n,)`` that alternate between facets: whether there are any."""
     from uem_dolfinx.contact.nodes.concave_edges import HOLD_AFTER, MOST_CHANGES
@@ -308,6 +309,27 @@ def _calm(pair: Interface, which: Bools) -> bool:
     some = which & pair.trial.active & (changes >= HOLD_AFTER) & (changes < MOST_CHANGES)
     pair.take(replace(pair.trial, changes=np.where(some, MOST_CHANGES, changes)))
     return bool(some.any())
+
+
+def foreseen(
+    bodies: Bodies, forces: Iterable[tuple[Interface, Traction]], du: Array, moved: Array, way: float, left: float, swept: bool
+) -> tuple[list[Array], list[Violations]]:
+    """Gaps after increments du ``(n_owned, gdim)``, and contactors that violate contact conditions then under ``forces`` (collective).
+
+    Gaps below ``way``, forces that move a contactor that far, and forces below ``left`` count as zero; see ``Interface.violated``.
+    """
+    gaps, violated = [], []
+    for pair, own in forces:
+        gap, found = pair.kinematics.gap, Violations.none(len(pair.nodes))
+        if pair.in_reach:
+            assert bodies.stiffness is not None
+            gap = pair.kinematics.gap_rows.gaps(du)
+            across = np.einsum("ng,ng->n", pair.kinematics.projection.normal**2, np.abs(bodies.stiffness[pair.nodes]))
+            least = np.maximum(bodies.rounding_at(pair.nodes), np.maximum(way * across, left))
+            found = pair.violated(gap, own, least, way, swept, moved)
+        gaps.append(gap)
+        violated.append(found)
+    return gaps, violated
 
 
 def count(pairs: Sequence[Interface], violated: Sequence[Violations]) -> int:

@@ -198,22 +198,22 @@ class Rows:
 
 @dataclass(frozen=True)
 class BodyState(IterationState):
-    """``IterationState`` with its rows, and the terms of the slip directions in tangent (``added``) and residual (``held``).
+    """``IterationState`` with its rows, and with the terms of the slip directions in tangent (``added``) and ``forces``.
 
     ``solved`` is the solution of its linearised problem, if known.
     """
 
     rows: Rows
     added: PETSc.Mat | None
-    held: PETSc.Vec | None
+    forces: PETSc.Vec
     solved: Solved | None = None
 
     def with_rows(
-        self, rows: Rows, solved: Solved | None, trial: Restriction, added: PETSc.Mat | None, held: PETSc.Vec | None, active: int
+        self, rows: Rows, solved: Solved | None, trial: Restriction, added: PETSc.Mat | None, forces: PETSc.Vec, active: int
     ) -> BodyState:
         """The same bodies with other rows; a known solution holds if no body has come loose, or was loose, by these (collective)."""
         alike = reduced(rows.test.comm, int(np.array_equal(rows.test.free, self.test.free)), op=MPI.LAND)
-        now = replace(self, rows=rows, test=rows.test, trial=trial, added=added, held=held, active=active)
+        now = replace(self, rows=rows, test=rows.test, trial=trial, added=added, forces=forces, active=active)
         return replace(now, right=False, solved=solved if alike else None)
 
     def set_operator(self, solver: UnitedSolver, K: PETSc.Mat, G: PETSc.Mat | None, roughly: bool) -> None:
@@ -267,8 +267,7 @@ def make_rows(
     if over_constraints.shared:
         _meet([pair for pair in pairs if not pair.target.n_nodes])
     equations, g = [pair.equations() for pair in pairs], prescribed.shape[1]
-    fields = ((i, _united_fields(pair)) for i, pair in enumerate(pairs))
-    heat = {i: [one.equations() for one in own] for i, own in fields if own}
+    heat = {i: [one.equations() for one in own] for i, pair in enumerate(pairs) if (own := _united_fields(pair))}
     users = [] if linear is None else [linear.at_present()]
     united = [e.rows for own in heat.values() for e in own]
     whole = ContactRows.join(equations, [*united, *users], g)

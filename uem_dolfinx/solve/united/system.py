@@ -14,9 +14,8 @@ from petsc4py import PETSc
 from uem_dolfinx import forms
 from uem_dolfinx.algebra.linear_solver import UnitedSolver
 from uem_dolfinx.algebra.restriction import Restriction
-from uem_dolfinx.arrays import Array
+from uem_dolfinx.arrays import Array, Indices
 from uem_dolfinx.contact.pair.interface import Interface, in_question
-from uem_dolfinx.contact.seam.active_set import Violations
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.warnings.checks import check_initial, check_prescribed, check_signs
 from uem_dolfinx.log import timed
@@ -29,7 +28,7 @@ from uem_dolfinx.solve.rigid.floating import FloatingBodies
 from uem_dolfinx.solve.rigid.unheld import refuse_bare
 from uem_dolfinx.solve.united import rows as united_rows
 from uem_dolfinx.solve.united.equilibrium import InEquilibrium, IterationState
-from uem_dolfinx.solve.united.exchanges import Exchanges, count
+from uem_dolfinx.solve.united.exchanges import Exchanges, count, foreseen
 from uem_dolfinx.solve.united.newton import FORCING, Increment, LinearisedProblem
 from uem_dolfinx.solve.united.normal_return import move_back
 from uem_dolfinx.solve.united.rows import BodyState, OverConstraints, Rows, make_rows
@@ -95,6 +94,7 @@ class BodySystem:
         self.linear, self.pairs = linear, list(pairs)
         self.rows: Rows | None = None  # equations of the last state
         self._here: Rows | None = None  # equations at the last projection, with its slip directions; None until needed
+        self._forces_here: tuple[Rows, PETSc.Vec, PETSc.Vec, PETSc.Vec] | None = None  # see ``_present_forces``
         self._look()
         self.exchanges, self.far_apart = Exchanges(self.pairs), FarApart(self.config, self.pairs)
         self.over_constraints = OverConstraints(self.config, self.pairs, self.linear)
@@ -113,7 +113,7 @@ class BodySystem:
         """Project the contactors at the present positions of bodies and targets."""
         if self.linear is not None:
             self.linear.place()
-        self._here = None
+        self._here = self._forces_here = None
         if not self.pairs:
             return
         self.bodies.check_displacement(min([pair.target.stride for pair in self.pairs]))
@@ -181,10 +181,10 @@ class BodySystem:
         if bodies.stiffness is None and self.pairs:
             # for the rounding of contact forces
             bodies.update_tangent()
-        F, rounding = self.residual(), self.rounding()
+        rounding = self.rounding()
         with timed("uniting equations"):
-            rows, self._here = self.present_rows(), None
-            residual = rows.test.reduce(y := rows.test.pass_on(F))
+            rows, F, y, residual = self._present_forces()
+            self._here = self._forces_here = None
             at_rest = in_equilibrium(norm := self.unknowns.norms(residual), self.bodies.forces_at_work(F), rounding)
             if at_rest or (turning and not pairs):
                 self._take(self._read_forces(rows, y))
@@ -209,7 +209,7 @@ class BodySystem:
                 rows = self._rows()
                 residual = rows.test.transpose(self.residual())
                 norm = self.unknowns.norms(residual)
-        trial, added, held, active, gap = self._trial_of(rows)
+        trial, added, forces, active, gap = self._trial_of(rows)
         self.rows = rows
         torn = max([heat.torn() for heat in self._heats], default=0.0)
         return BodyState(
@@ -227,14 +227,8 @@ class BodySystem:
             in_contact=bool(self.pairs),
             rows=rows,
             added=added,
-            held=held,
+            forces=forces,
         )
-
-    def _across(self, pair: Interface) -> Array:
-        """Stiffness of contactors along their normals ``(n,)``."""
-        assert self.bodies.stiffness is not None
-        normal = pair.kinematics.projection.normal
-        return np.asarray(np.einsum("ng,ng->n", normal**2, np.abs(self.bodies.stiffness[pair.nodes])))
 
     def rows_of_last(self) -> Rows:
         """Equations of the last state; those at the last projection if a run begins or continues, and of mortar (collective)."""
@@ -252,13 +246,20 @@ class BodySystem:
             self._here = self._rows()
         return self._here
 
+    def _present_forces(self) -> tuple[Rows, PETSc.Vec, PETSc.Vec, PETSc.Vec]:
+        """Equations at the last projection, forces F there, the same transferred by Q, and Q'F (collective)."""
+        if self._forces_here is None:
+            rows, F = self.present_rows(), self.residual()
+            self._forces_here = rows, F, (y := rows.test.pass_on(F)), rows.test.reduce(y)
+        return self._forces_here
+
     def _rows(self) -> Rows:
         """Equations of all pairs in their present states, and Q (collective)."""
         hold = partial(self.floating.hold, self.bodies.free_rows)
         return make_rows(self.over_constraints, self.near, hold, self.bodies.prescribed, self.linear)
 
-    def _trial_of(self, rows: Rows, convex: bool = False) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec | None, int, float]:
-        """P, terms of the slip directions in tangent and residual, number of active contactors, and their largest gap (collective)."""
+    def _trial_of(self, rows: Rows, convex: bool = False) -> tuple[Restriction, PETSc.Mat | None, PETSc.Vec, int, float]:
+        """P, tangent of the slip directions, forces with their terms, number of active contactors, and their largest gap (collective)."""
         # if equations conflict, P might eliminate other components than Q
         trial, moved = rows.frictionless, None if rows.conflict else rows.whole.moved
         if moved is not None:
@@ -267,7 +268,9 @@ class BodySystem:
         gaps = [one.largest_gap_here() for one in (*self.near, self.linear) if one is not None]
         united = sum([int(pair.united.sum()) for pair in self.near])
         each = gathered(self.comm, np.array([united, max(gaps)])) if gaps else np.zeros((1, 2))
-        return trial, *slip_terms(self.near, self.unknowns.like, self.linear, convex), int(each[:, 0].sum()), each[:, 1].max()
+        added, held = slip_terms(self.near, self.unknowns.like, self.linear, convex)
+        forces = self.residual() if held is None else self.residual() + held
+        return trial, added, forces, int(each[:, 0].sum()), each[:, 1].max()
 
     def exchange(self, problem: LinearisedProblem, step: Increment) -> BodyState | None:
         """The state with an active set changed where gaps and forces, both to first order, violate contact conditions (collective)."""
@@ -286,12 +289,7 @@ class BodySystem:
             near = max(PREDICTED, left) * way
             sliding = self._sliding(F, forces)
             moved = increment if sliding is None else increment + sliding
-            gaps = [pair.kinematics.gap_rows.gaps(increment) if pair.in_reach else pair.kinematics.gap for pair in self.pairs]
-            violated = [Violations.none(len(pair.nodes)) for pair in self.pairs]
-            for k, pair in [(k, pair) for k, pair in enumerate(self.pairs) if pair.in_reach]:
-                along = self._across(pair)
-                least = np.maximum(self.bodies.rounding_at(pair.nodes), np.maximum(near * along, left * driving))
-                violated[k] = pair.violated(gaps[k], forces[k], least, near, self._swept, moved)
+            gaps, violated = foreseen(self.bodies, zip(self.pairs, forces), increment, moved, near, left * driving, self._swept)
             arrays = not self._adrift and self.exchanges.take_long(violated, self.solver.cheap, self.solver.gives_way)
             if arrays and (
                 solved := state.rows.settle(self.bodies, self.solver, self.residual(), self.curvature, increment, left)
@@ -323,9 +321,7 @@ class BodySystem:
         """``F = K du`` plus the terms of contact and friction, and the present forces (collective)."""
         for more in filter(None, (self.curvature, state.added)):
             F.axpy(1.0, forms.product(more, du))
-        F.axpy(1.0, self.residual())
-        if state.held is not None:
-            F.axpy(1.0, state.held)
+        F.axpy(1.0, state.forces)
         return F
 
     def _sliding(self, F: PETSc.Vec, forces: list[Traction]) -> Array | None:
@@ -365,7 +361,7 @@ class BodySystem:
 
         Q uses the present normals and slips: with the old Q, rotated contact forces would count as residual.
         """
-        return self.present_rows().test.transpose(self.residual())
+        return self._present_forces()[-1]
 
     def accelerate(self, restriction: Callable[[], Restriction] | None = None) -> None:
         """Find the initial acceleration of the bodies, with P of all equations or what ``restriction`` returns (collective)."""
@@ -409,14 +405,15 @@ class BodySystem:
         refuse_bare(self.bodies, P, Q, curvature)
         # modified Newton ignores changes of coefficients in P
         state.set_operator(self.solver, K, curvature, roughly=self.newton == "modified")
+        inexact = self.solver.inexact
         linear = self.bodies.linear and not (self._soft or (self.linear is not None and self.linear.turning))
         # in dynamics momentum is conserved exactly by exact solves
         passing = not linear or (self.curvature is not None and self.bodies.dynamics is None)
         return LinearisedProblem(
             state=state,
             rhs=-Q.transpose(self._predicted_forces(state, c, forms.product(K, c))),
-            exact=state.solved is not None or (not self.solver.inexact and (self.bodies.dynamics is not None or not passing)),
-            iterative=self.solver.inexact and state.solved is None,
+            exact=state.solved is not None or (not inexact and (self.bodies.dynamics is not None or not passing)),
+            iterative=inexact and state.solved is None,
             passing=passing,
             fits=linear or (self.linear is not None and self.linear.joints_led(CLOSED * self.config.size)),
             convex=self.exchanges.convex or self.exchanges.jumps,
@@ -427,10 +424,12 @@ class BodySystem:
         """Unknowns dq, and ``du = P dq + c``, in all nodes if open motions or separated contacts need them (collective)."""
         self.solver.begin_at(problem.state.trial.c, first(problem.state.rounding))
         dq, iterations = self.solver.solve(problem.rhs, accuracy, near)
-        if near is None:
-            some = None if self.floating.neutral or (self.pairs and self.far_apart.any) else [p.nodes for p in self.pairs]
-            dq = self.solver.complete(dq, some)
+        dq = self.solver.complete(dq, self._needed) if near is None else dq
         return Increment(dq, self.move(problem.state, dq), problem.rhs, iterations, self.solver.left(accuracy))
+
+    def _needed(self) -> list[Indices] | None:
+        """Nodes whose motion decides on contact; None for all, if open motions or separated contacts need them."""
+        return None if self.floating.neutral or (self.pairs and self.far_apart.any) else [pair.nodes for pair in self.pairs]
 
     def complete(self, problem: LinearisedProblem, step: Increment) -> Increment:
         """The increment in all unknowns, if the last solve was condensed onto the contact (collective)."""
