@@ -63,9 +63,8 @@ class PartSolver(UnitedSolver):
         with timed("united matrix of explicit steps"):
             self._unite(P, Q, K, G)
 
-    def begin_step(self) -> None:
+    def renew(self) -> None:
         """Let no factorisation of an earlier step serve, which a run continued from a checkpoint does not have."""
-        super().begin_step()
         self._alike = None
 
     def take(self, solved: Any, P: Restriction, K: PETSc.Mat, G: PETSc.Mat | None, Q: Restriction) -> None:

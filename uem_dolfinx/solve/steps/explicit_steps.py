@@ -161,6 +161,7 @@ class StepperWithMass(ExplicitStepper):
         rows = system.rows_of_last()
         P, Q = rows.frictionless, rows.test
         if problem.linear is not None or not Q.n_equations:
+            system.solver.renew()
             bodies.u.x.array[:] = free_to
             bodies.u.x.scatter_forward()
             return
