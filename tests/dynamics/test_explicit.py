@@ -356,3 +356,26 @@ def test_what_does_not_go_is_refused(what):
         )  # fmt: skip
         for _ in uem.time_steps(problem, end=0.1, **how.get("steps", {})):
             problem.solve()
+
+
+@pytest.mark.parametrize("contactors", ["massless", "massy"])
+@pytest.mark.parametrize("soft", [0, 1])
+def test_what_explicit_steps_would_hide_is_refused(contactors, soft):
+    """A negative modulus in one of two bodies, and load steps: each by its name, with nothing moved."""
+    s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 10.0], [1, 12]),
+                                      box("quadrilateral", [0.0, 10.1], [1.0, 20.0], [1, 12])])  # fmt: skip
+    V = compat.function_space(s.mesh, 1, (2,))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    sign = fem.Constant(s.mesh, 1.0)
+    up = ufl.gt(ufl.SpatialCoordinate(s.mesh)[1], 10.05)
+    factor = ufl.conditional(up, sign, 3.0) if soft else ufl.conditional(up, 3.0, sign)
+    form = factor * uem.LinearElastic(900.0, 0.0, kind="plane_stress").residual(u, v) * ufl.dx
+    dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=uem.CentralDifferences(), contactors=contactors)
+    contact = uem.Contact(s.tag("up", 1, at(1, 10.1)), s.tag("low", 0, at(1, 10.0)))
+    problem = uem.UnitedProblem(form, u, contacts=[contact], dynamics=dynamics)
+    with pytest.raises(uem.InputError, match="load_steps does not go with CentralDifferences"):
+        uem.load_steps(problem, 2)
+    sign.value = -1.0
+    with pytest.raises(uem.InputError, match="tangent of the bodies is indefinite"):
+        next(uem.time_steps(problem, end=0.1))
+    assert not u.x.array.any()

@@ -349,3 +349,15 @@ def _flat_cell(config: Configuration) -> str:
     flat = np.flatnonzero(flat_cells(cell, 1, nodes, mesh.geometry.x))
     found = described(mesh.geometry.x[nodes[flat[0]]].mean(axis=0)[: config.gdim]) if len(flat) else ""
     return next(filter(None, config.comm.allgather(found)), "")
+
+
+def driven_on(config: Any, diagonal: Array, rounding: float) -> str | None:
+    """Words for what the ``diagonal`` of K ``(n_owned, gdim)`` drives on beyond a part ``rounding``, or None (collective)."""
+    largest = reduced(config.comm, float(np.abs(diagonal).max(initial=0.0)), op=MPI.MAX)
+    node, axis = (some[:1] for some in np.nonzero(diagonal < -rounding * largest))
+    offers = config.comm.allgather([f"{'xyz'[axis[0]]} at {config.describe(int(node[0]))}"] if len(node) else [])
+    place = next(filter(None, offers), None)
+    return place and (
+        f"the tangent of the bodies is indefinite: a displacement along {place[0]} alone is driven on, not resisted; check "
+        "the sign of F, and that moduli are positive"
+    )

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from mpi4py import MPI
-
 import numpy as np
 from petsc4py import PETSc
 
@@ -21,6 +19,7 @@ from uem_dolfinx.geometry.nodes import described
 from uem_dolfinx.parallel import reduced
 from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
 from uem_dolfinx.solve.bodies.field_scales import ratio
+from uem_dolfinx.solve.bodies.tangent import driven_on
 
 
 def unheld(bodies: Bodies, field: int, residual: float) -> FloatingBodyError:
@@ -66,15 +65,8 @@ def explain(problem: Any, error: UEMError, stiffness: Array | None, mendable: bo
         diagonal = (bodies.initial_stiffness() if start is None else start) * bodies.free[: config.n_owned]
     except UEMError:
         diagonal = np.zeros((config.n_owned, config.gdim))
-    largest = reduced(config.comm, float(np.abs(diagonal).max(initial=0.0)), op=MPI.MAX)
-    node, axis = (some[:1] for some in np.nonzero(diagonal < -FORCE_ROUNDING * largest))
-    offers = config.comm.allgather([f"{'xyz'[axis[0]]} at {config.describe(int(node[0]))}"] if len(node) else [])
-    if place := next(filter(None, offers), None):
-        error.amend(
-            f"the tangent of the bodies is indefinite: a displacement along {place[0]} alone is driven on, not resisted; check "
-            "the sign of F, and that moduli are positive",
-            instead=True,
-        )
+    if words := driven_on(config, diagonal, FORCE_ROUNDING):
+        error.amend(words, instead=True)
     elif mendable:
         problem.watch.name_corner(stiffness, error)
 

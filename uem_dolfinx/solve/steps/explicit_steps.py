@@ -28,8 +28,8 @@ from uem_dolfinx.dynamics.explicit.part_solver import MassSolver
 from uem_dolfinx.dynamics.explicit.stepper import ExplicitStepper
 from uem_dolfinx.errors import InputError, MassError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger
-from uem_dolfinx.solve.bodies.bodies import Bodies
-from uem_dolfinx.solve.bodies.tangent import not_finite
+from uem_dolfinx.solve.bodies.bodies import FORCE_ROUNDING, Bodies
+from uem_dolfinx.solve.bodies.tangent import driven_on, not_finite
 from uem_dolfinx.solve.stepping import TimeStep, events, touching
 
 
@@ -209,7 +209,7 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
         end: time to reach.
 
     Raises:
-        InputError: if ``dt`` exceeds the critical step, or strains cells too far.
+        InputError: if ``dt`` exceeds the critical step, or strains cells too far, or if the stiffness at the start is negative.
     """
     control, dynamics = problem.step_control, problem.dynamics
     kind: type[ExplicitStepper] = ExplicitStepper
@@ -219,6 +219,11 @@ def explicit_steps(problem: Any, dt: float | None, end: float) -> Iterator[TimeS
     resumed = dt is None and dynamics.resumed and dynamics.time > dynamics.start
     problem.set_load(dynamics.time)
     if not dynamics.accelerated:
+        # no inertia may hide what the bodies' own stiffness drives on
+        with dynamics.without_inertia():
+            diagonal = problem.bodies.initial_stiffness() * problem.bodies.free[: problem.config.n_owned]
+        if words := driven_on(problem.config, diagonal, FORCE_ROUNDING):
+            raise InputError(words)
         stepper.begin()
     if dynamics.time >= end:
         return

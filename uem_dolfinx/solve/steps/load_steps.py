@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from uem_dolfinx import given
+from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.parallel import agreed, ask_together
@@ -53,7 +54,7 @@ def load_steps(
     Raises:
         InputError, InputTypeError: if ``steps`` is neither a positive whole number nor a list of ``Step``, or if a step is not of this
             problem. With ``arc_length`` if no load moves the bodies, if Dirichlet values do, for a list of ``Step``, or with ``tolerance``.
-            With ``tolerance`` while the problem is recorded.
+            With ``tolerance`` while the problem is recorded. With central differences.
         CheckpointError: see ``Checkpoint``.
         ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: if a step fails even at 1/1024 of its
             nominal length; the last converged state is kept.
@@ -61,6 +62,8 @@ def load_steps(
         KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM; the last converged state is kept.
     """
     check_steps(problem, checkpoint)
+    if is_explicit(problem.dynamics):
+        raise InputError("load_steps does not go with CentralDifferences: take time_steps, or leave dynamics out for statics")
     several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
     with agreed(problem.comm):
         by = None
