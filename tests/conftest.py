@@ -201,14 +201,24 @@ def lever(contact: uem.Contact) -> float:
     cut = isinstance(pair.discretisation, Contactors) and pair.discretisation.elimination.seam.any
     if isinstance(contact, uem.Preload) or cut:
         return np.inf
-    sideways = pair.friction is not None or pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
-    if pair.kinematics.projection.offset is not None and sideways:
+    corners = pair.config.comm.allreduce(bool(pair.trial.in_corner.any()), op=MPI.LOR)
+    if pair.kinematics.projection.offset is not None and (corners or pair.friction is not None):
         return np.inf
-    # across a gap the averaged normals of a soft contact lean by the angle of the facets
-    if contact.normal is not None and highest(pair.config.comm, pair.trial.changes) >= MOST_CHANGES:
-        return 1e-6
+    # across a gap the averaged normals of a soft contact lean by the angle of the facets, and its forces in corners by more
+    if contact.normal is not None and (corners or highest(pair.config.comm, pair.trial.changes) >= MOST_CHANGES):
+        return 1e-6 + across_gaps(contact)
     means = not pair.discretisation.traits.at_feet or pair.config.degree > 1
     return 1e-7 if pair.friction is not None and means else 1e-11
+
+
+def across_gaps(contact: uem.Contact) -> float:
+    """Forces in corners times the distances from their edges, over the sum of absolute moments (collective)."""
+    pair, config = contact.pair, contact.config
+    i, force = pair.trial.in_corner, contact.force.x.array.reshape(-1, config.gdim)[: config.n_owned]
+    across = np.abs(pair.kinematics.projection.gap[i]) @ np.linalg.norm(pair.trial.force[i], axis=1)
+    every = np.linalg.norm(force, axis=1) @ np.linalg.norm(config.x[: config.n_owned], axis=1)
+    across, every = config.comm.allreduce(np.array([across, every]))
+    return float(across / every) if every > 0.0 else 0.0
 
 
 @pytest.fixture

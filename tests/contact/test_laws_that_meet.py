@@ -1,10 +1,12 @@
 """Every law with both couplings, degrees, ways to declare it and to slide, in statics and in time: resumed, written, on any ranks.
 
-Two blocks are pressed and sheared by a lid. Each case is right by the balance of its forces, or refused by name.
+Two blocks are pressed and sheared by a lid, which is led, or on a spring, a hinge or a slider. Each case is right by the balance of its
+forces, or refused by name.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 
 from mpi4py import MPI
@@ -21,6 +23,8 @@ import uem_dolfinx as uem
 COMM = MPI.COMM_WORLD
 #: Stiffness of the spring at a lid, and how far a lid goes, or what force it has.
 SPRING, ALONG, DOWN = 0.2, 0.04, 0.03
+#: Middle of the lid, and the axis along which it slides.
+MIDDLE, LEANING = (0.5, 1.0), (0.3, -1.0)
 #: How a law is given to a contact.
 LAWS = {
     "hard": {"friction": 0.3},
@@ -81,13 +85,18 @@ class Sheared:
             self.down.value[1] = -DOWN * min(2 * part, 1.0)
 
         bcs += clamp(space, b.bottom)
-        self.lid = None
+        self.lid = self.joint = None
         if lid == "led":
             bcs += [uem.dirichlet(space, b.top, 0, along), uem.dirichlet(space, b.top, 1, self.down[1])]
+        elif lid == "sprung":
+            self.lid = uem.RigidCoupling(b.top, MIDDLE, motion=(along, None, 0.0), force=self.down)
+            more["couplings"] = [self.lid, uem.Spring(None, self.lid, SPRING, points=(MIDDLE, MIDDLE), free_length=0.0)]
         else:
-            self.lid = uem.RigidCoupling(b.top, (0.5, 1.0), motion=(along, None, 0.0), force=self.down)
-            spring = uem.Spring(None, self.lid, SPRING, points=((0.5, 1.0), (0.5, 1.0)), free_length=0.0)
-            more["couplings"] = [self.lid, spring]
+            self.lid = uem.RigidCoupling(b.top, MIDDLE, force=self.down)
+            hinge = partial(uem.Hinge, point=(0.0, 1.0), stiffness=SPRING)
+            joint = hinge if lid == "hinged" else partial(uem.Slider, point=MIDDLE, axis=LEANING)
+            self.joint = joint(None, self.lid)
+            more["couplings"] = [self.lid, self.joint]
         if declared == "contact":
             self.contact = uem.Contact(b.high, b.low, coupling=coupling, sliding=sliding, **how)
         else:
@@ -110,6 +119,8 @@ class Sheared:
         """Force of all above: of the lid, and of its spring ``(2,)`` (collective)."""
         if self.lid is None:
             return self.problem.reaction(self.b.top)
+        if self.joint is not None:
+            return self.joint.force + self.down.value
         return self.lid.reaction[0] + self.down.value - SPRING * self.lid.displacement
 
 
@@ -120,6 +131,8 @@ CASES = [
     for j, (coupling, degree) in enumerate(product(("node_to_surface", "mortar"), (1, 2)))
     for k in (0, 6)
 ]
+#: Soft contact on a hinge at the lid's end, and on a slider that leans.
+CASES += [("soft", "node_to_surface", degree, "contact", "finite", False, ("hinged", "slid")[degree - 1]) for degree in (1, 2)]
 
 
 @pytest.mark.slow

@@ -258,7 +258,7 @@ def refuse_soft(contact: Contact) -> None:
 
 
 def refuse_sharp(contact: Contact) -> None:
-    """Refuse a soft contact whose areas change where it presses: nodes at sharp edges, mortar's facets covered in part (collective)."""
+    """Refuse soft contact whose areas change where it presses, at sharp edges or facets covered in part, and in corners (collective)."""
     if contact.normal is None:
         return
     pressing = contact.pair.trial.lam > 0.0
@@ -271,6 +271,11 @@ def refuse_sharp(contact: Contact) -> None:
                 "make the contactor the smaller surface, or take sliding='small'"
             )
         return
+    if reduced(contact.config.comm, int((pressing & contact.pair.trial.in_corner).sum())):
+        raise InputError(
+            f"contact '{contact.name}': corners of the target hold contactors of soft contact, whose axes turn with the bodies, of which "
+            "there are no derivatives: take normals='averaged' or coupling='mortar'"
+        )
     pressing &= contact.surface.at_sharp_edges(contact.nodes)
     if reduced(contact.config.comm, int(pressing.sum())):
         raise InputError(

@@ -49,13 +49,17 @@ class Family:
     weight: Array  # weight of each term ``(k,)``
     of_facet: Bools  # whether the child is the middle of a facet and the parent the middle of an edge ``(k,)``
 
-    def control_gaps(self, projection: Projection, closing: Array, usable: Bools) -> ControlGaps:
-        """Terms for this projection, with gaps of ``usable (n,)`` contactors, above the target and in no corner (collective).
+    def control_gaps(self, projection: Projection, closing: Array, usable: Bools, share: Array) -> ControlGaps:
+        """Terms for this projection, with gaps of ``usable (n,)`` contactors, above the target (collective).
 
-        ``closing (n, gdim)`` are derivatives of the nodes' gaps by their positions.
+        Args:
+            projection: of the contactors.
+            closing: derivatives of the nodes' gaps by their positions ``(n, gdim)``.
+            usable: see above.
+            share: gaps from the facets of a corner over the gap along its axis, 1 elsewhere ``(n,)``.
         """
         p, g, nn = projection, self.config.gdim, projection.nodes.shape[1]
-        rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights, closing])
+        rows = np.column_stack([p.gap, usable, p.normal, p.nodes, p.weights, closing, share])
         seen = self.config.from_owners(self.nodes, rows, self.parent)
         gap, normal, i = seen[:, 0], seen[:, 2 : 2 + g], self.child
         length = np.linalg.norm(self.config.X[self.nodes[i]] - self.config.X[self.parent], axis=1)
@@ -64,12 +68,14 @@ class Family:
         smooth &= usable[i] & (seen[:, 1] > 0)
         alone = np.zeros(len(self.nodes), dtype=bool)
         alone[i[~smooth]] = True
-        targets, weights, closing = np.split(seen[:, 2 + g :], [nn, 2 * nn], axis=1)
-        return ControlGaps(self, ~alone[i], gap, normal, targets.astype(np.int64), weights, closing)
+        targets, weights, closing = np.split(seen[:, 2 + g : -1], [nn, 2 * nn], axis=1)
+        weight = self.weight * seen[:, -1] / share[i]
+        return ControlGaps(self, ~alone[i], weight, gap, normal, targets.astype(np.int64), weights, closing)
 
-    def sums(self, terms: Bools) -> Sums:
-        """Matrix of sums of weight times child at the parents, for some of the terms ``(k,)``."""
-        return Sums(self.config, self.nodes, self.child[terms], self.parent[terms], self.weight[terms])
+    def sums(self, terms: Bools, weight: Array | None = None) -> Sums:
+        """Matrix of sums of weight times child at the parents, for some of the terms ``(k,)``; ``weight (k,)`` replaces their own."""
+        found = self.weight if weight is None else weight
+        return Sums(self.config, self.nodes, self.child[terms], self.parent[terms], found[terms])
 
     def basis(self, shared: Bools) -> Basis:
         """The Bernstein basis for terms ``shared (k,)`` with quadratic gaps; its scale is relative to the functions of scaled gaps."""
@@ -85,6 +91,7 @@ class ControlGaps:
 
     family: Family  # family of the terms
     shared: Bools  # whether the gap is quadratic between the child and all its parents ``(k,)``
+    weight: Array  # weights of the terms, of gaps along the axes of corners ``(k,)``
     gap: Array  # of the parents ``(k,)``
     normal: Array  # of the parents ``(k, gdim)``
     targets: Ints  # global nodes that the parents follow ``(k, nn)``
@@ -94,12 +101,17 @@ class ControlGaps:
     def of(self, gap: Array) -> Array:
         """Control gaps from nodal gaps ``(n,)``."""
         k, f = self.shared, self.family
-        return gap - np.bincount(f.child[k], f.weight[k] * self.gap[k], minlength=len(gap))
+        return gap - np.bincount(f.child[k], self.weight[k] * self.gap[k], minlength=len(gap))
 
     def forces(self, multipliers: Array, active: Bools) -> tuple[Array, Array]:
         """Control forces and nodal forces along the normals from the multipliers of the equations, each ``(n,)`` (collective)."""
         control = np.where(active, multipliers, 0.0)
-        return self.basis.scale * control, control - self.family.sums(self.shared).of(control)
+        return self.basis.scale * control, control - self.sums.of(control)
+
+    @property
+    def sums(self) -> Sums:
+        """Matrix of sums of weight times child at the parents."""
+        return self.family.sums(self.shared, self.weight)
 
     @cached_property
     def basis(self) -> Basis:
@@ -109,7 +121,7 @@ class ControlGaps:
     def extend(self, equations: UnitingEquations, normal: Array) -> UnitingEquations:
         """Add the terms of the parents, along ``normal (k, gdim)``, to the equations of all contactors."""
         f, k = self.family, np.flatnonzero(self.shared)
-        own = f.weight[k, None] * normal[k]
+        own = self.weight[k, None] * normal[k]
         a, b = np.nonzero(self.targets[k] >= 0)
         row = f.child[k]
         return replace(
@@ -137,8 +149,13 @@ class Bernstein(NodeToSurface):
     def measured(self, kinematics: NodalKinematics, state: PairState) -> ControlKinematics:
         """The kinematics with control gaps (collective)."""
         k, gap = kinematics, kinematics.projection.gap
-        usable = ~k.ends.past(state) & ~state.in_corner
-        control = self.family.control_gaps(k.projection, k.closing, usable)
+        # in a corner a law of gaps acts along its axis, where the gaps from all its facets are equal
+        usable, share = ~k.ends.past(state), np.ones(len(gap))
+        if state.law_gap is None:
+            usable &= ~state.in_corner
+        elif k.corners is not None:
+            share[k.corners.which] = 1.0 / np.linalg.norm(k.corners.summing, axis=1)
+        control = self.family.control_gaps(k.projection, k.closing, usable, share)
         plain = (k.of, k.points, k.projection, k.nearest, control.of(gap), k.corners, k.target_moves, k.out)
         return ControlKinematics(*plain, control=control)
 
@@ -158,7 +175,7 @@ class ControlKinematics(NodalKinematics):
         return (
             np.concatenate([row, f.child[k], f.child[k][t]]),
             np.concatenate([followed, f.config.to_global(f.parent[k]), c.targets[k][t, a]]),
-            np.concatenate([weight, f.weight[k], -f.weight[k][t] * c.weights[k][t, a]]),
+            np.concatenate([weight, c.weight[k], -c.weight[k][t] * c.weights[k][t, a]]),
         )
 
     @property
@@ -175,7 +192,7 @@ class ControlKinematics(NodalKinematics):
 
     def _nodal_friction(self, tau: Array) -> Array:
         """Friction at the nodes from friction at the control points, without reactions on targets that are contactors (collective)."""
-        sums = self.control.family.sums(self.control.shared)
+        sums = self.control.sums
         return np.column_stack([along - sums.of(along) for along in tau.T])
 
     def pressure_map(self, current: bool) -> PressureMap:

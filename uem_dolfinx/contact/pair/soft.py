@@ -10,6 +10,10 @@ gaps g_i* under them: the problem also closes what is left between g_i and g_i*.
 forces by the gaps of every iterate would be too large. Rows contain both bodies: action equals reaction. For bodies that only
 contact holds, gaps with a stiffness are held.
 
+In a concave corner of a faceted target the gaps from its facets are equal: equations along the further axes of the corner, which are
+united, with multipliers that share the force of the law among the facets. The force is that of the gap along the mean of their normals,
+and a contactor leaves a facet that pulls in equilibrium.
+
 With damping c the pressure at the end of a time step dt that begins at the gap h is
 
     P(g) = max(p(g) + c (min(h, r) - min(g, r)) / dt, 0)
@@ -33,11 +37,12 @@ from dolfinx import fem
 from uem_dolfinx.algebra.equations import UnitingEquations
 from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.laws.soft import SoftContact
-from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, with_averaged_normals
+from uem_dolfinx.contact.nodes.concave_edges import MOST_CHANGES, ConcaveEdges
 from uem_dolfinx.contact.nodes.node_to_surface import NodeToSurface
 from uem_dolfinx.contact.pair.interface import Interface
 from uem_dolfinx.contact.seam.active_set import TOUCHING, Violations
-from uem_dolfinx.contact.seam.placement import ContactRows, Traction
+from uem_dolfinx.contact.seam.corners import Corners
+from uem_dolfinx.contact.seam.placement import NORMAL, ContactRows, Traction
 from uem_dolfinx.contact.seam.relative_motion import grouped
 from uem_dolfinx.contact.seam.state import PairState
 from uem_dolfinx.parallel import reduced
@@ -62,30 +67,33 @@ def traction_by_gaps(pair: Interface, multipliers: Array) -> Traction:
     """Contact forces of multipliers ``(n,)`` of the rows of all gaps, without those along further axes of corners (collective)."""
     every = np.ones(len(pair.nodes), dtype=bool)
     rows = pair.kinematics.gap_rows.select(np.arange(len(every)), every)
-    return pair.kinematics.forces(
-        replace(pair.trial, active=every), rows, np.where(rows.normal, multipliers[rows.contactor], 0.0)
-    )
+    along = np.where(rows.normal, multipliers[rows.contactor], 0.0)
+    found = pair.kinematics.forces(replace(pair.trial, active=every), rows, along)
+    return found._replace(lam=multipliers * pair.kinematics.pressure_map(False).force)
 
 
-class _Edges:
-    """In place of ``ConcaveEdges``: facets press alone, also in corners; contactors that alternate between them get averaged normals."""
+def _in_corners(found: Traction, rows: ContactRows, multipliers: Array) -> Traction:
+    """With the multipliers ``(m,)`` of rows along further axes of corners, by which forces are shared among their facets."""
+    force, i = found.force.copy(), np.flatnonzero(rows.kind > NORMAL)
+    np.add.at(force, rows.contactor[i], multipliers[i, None] * rows.rows.direction[i])
+    return found._replace(force=force)
 
-    def place(self, nearest: Any, points: Array, state: PairState) -> tuple[Any, None]:
-        """Projection of all contactors, and no corners."""
-        return with_averaged_normals(nearest, state.changes >= MOST_CHANGES, points), None
 
-    def place_again(self, nearest: Any, left: Bools, points: Array, state: PairState) -> tuple[Any, Any, None]:
-        """The same in another state."""
-        return nearest, *self.place(nearest, points, state)
+class _Corners(ConcaveEdges):
+    """``ConcaveEdges``; contactors that press leave a corner in equilibrium only, as a function says: predicted forces pull too early."""
 
-    def leave(self, corners: None, state: PairState) -> tuple[PairState, Bools]:
-        """None leaves a corner."""
-        return state, np.zeros(len(state.active), dtype=bool)
+    def __init__(self, of: NodeToSurface, in_equilibrium: Callable[[], bool]):
+        super().__init__(of)
+        self._in_equilibrium = in_equilibrium
 
-    def follow(self, nearest: Any, left: Bools, points: Array, state: PairState) -> tuple[PairState, bool]:
-        """Count changes of facet."""
-        moved = state.active & (state.facet >= 0) & (state.facet != nearest.facet)
-        return replace(state, facet=nearest.facet, changes=state.changes + moved), False
+    def leave(self, corners: Corners | None, state: PairState) -> tuple[PairState, Bools]:
+        """See ``ConcaveEdges``."""
+        after, left = super().leave(corners, state)
+        if self._in_equilibrium():
+            return after, left
+        stay = left & state.active
+        facet, held = np.where(stay, state.facet, after.facet), np.where(stay[:, None], state.held, after.held)
+        return replace(after, facet=facet, held=held), left & ~stay
 
 
 class SoftInterface(Interface):
@@ -104,7 +112,7 @@ class SoftInterface(Interface):
         self._damped: tuple[Array, Array, Array] | None = None
         if isinstance(self.discretisation, NodeToSurface):
             # also at corners of bodies in general contact: those opposite do not press
-            self.discretisation.follow_by(_Edges())
+            self.discretisation.follow_by(_Corners(self.discretisation, lambda: self._settled))
         n = len(self.nodes)
         # surfaces that are far apart at the start have a state of damping, too
         damping = np.tile([np.inf, 0.0, np.inf, 0.0, float(contact._at)], (n, 1)) if law.damping else None
@@ -114,6 +122,7 @@ class SoftInterface(Interface):
         self._at = self._multipliers = self._stiffness = self._area = np.zeros(n)
         self._holds: Bools = np.zeros(n, dtype=bool)
         self._stops = True  # whether the law has a slope at rest, which stops bodies that fall
+        self._settled = False  # whether forces are those of an equilibrium
         #: Gaps and multipliers that the last linearised problem predicts ``(n,)``, or None.
         self._predicted: tuple[Array, Array] | None = None
 
@@ -127,6 +136,10 @@ class SoftInterface(Interface):
     def project(self) -> None:
         """See ``Interface``; the law gives the forces of the gaps there (collective)."""
         super().project()
+        self._press()
+
+    def _press(self) -> None:
+        """Forces and stiffnesses of the present gaps by the law, and their share among facets of corners (collective)."""
         n, known = len(self.nodes), self.trial.law_gap
         if not self._acts or known is None:
             self._multipliers, self._stiffness, self._holds = *np.zeros((2, n)), np.zeros(n, dtype=bool)
@@ -145,7 +158,9 @@ class SoftInterface(Interface):
         self._multipliers, self._stiffness = self._area * p / self._force, -self._area * slope / self._force**2
         self._holds = (self._area > 0.0) & (slope < 0.0) & (slope <= HELD_FROM * stiff)
         self._stops = stiff < 0.0
-        super().set_forces(traction_by_gaps(self, self._multipliers))
+        rows = self.equations()
+        shared = np.einsum("mg,mg->m", rows.rows.direction, self.trial.force[rows.contactor])
+        super().set_forces(_in_corners(traction_by_gaps(self, self._multipliers), rows, shared))
 
     def _of_law(self, gap: Array) -> tuple[Array, Array]:
         """Pressures p and their derivatives at gaps ``(n,)`` (collective)."""
@@ -201,13 +216,16 @@ class SoftInterface(Interface):
 
     def forces(self, equations: ContactRows, multipliers: Array, du: Array | None = None) -> Traction:
         """Contact forces, present or predicted by the linearised law; see ``Interface`` (collective)."""
-        if du is None or not self._acts:
+        if not self._acts:
             return self.traction
+        self._settled = du is None
+        if du is None:
+            return _in_corners(traction_by_gaps(self, self._multipliers), equations, multipliers)
         rows, force = self.kinematics.gap_rows, self._force
         ahead = rows.equations.gap[: len(force)] + rows.along(du)
         predicted = self._multipliers - self._stiffness * (ahead - force * self._at)
         self._predicted = ahead / force, predicted
-        return traction_by_gaps(self, np.maximum(predicted, 0.0))
+        return _in_corners(traction_by_gaps(self, np.maximum(predicted, 0.0)), equations, multipliers)
 
     def set_forces(self, found: Traction, active: Bools | None = None) -> None:
         """Set contact forces of the trial state; predicted ones hold from the next placement on (collective)."""
@@ -245,12 +263,16 @@ class SoftInterface(Interface):
 
     def applied_forces(self) -> tuple[Ints, Array] | None:
         """The contact forces by the rows, as loads of both bodies."""
-        return self.kinematics.gap_rows.forces(self._multipliers) if self._acts else None
+        return self.kinematics.gap_rows.forces(self._all(self._multipliers)) if self._acts else None
+
+    def _all(self, multipliers: Array) -> Array:
+        """Multipliers of all rows ``(m,)``, zero along further axes of corners."""
+        return np.append(multipliers, np.zeros(len(self.kinematics.gap_rows.equations) - len(multipliers)))
 
     def pushed_by(self, m: fem.Constant) -> Array:
         """Derivative of the residual by a Constant of the law at the owned nodes ``(n_owned, gdim)`` (collective)."""
         by = self._law.by_constant(self.config.comm, self.name, self._at, m)
-        nodes, forces = self.kinematics.gap_rows.forces(self._area * by / self._force)
+        nodes, forces = self.kinematics.gap_rows.forces(self._all(self._area * by / self._force))
         return -self.config.add_at_owners(nodes, forces)
 
     def slip_terms(self, convex: bool = False) -> tuple[Ints, Array, Array] | None:
@@ -262,8 +284,11 @@ class SoftInterface(Interface):
         return nodes, k[:, None, None] * v[:, :, None] * v[:, None, :], (k * left)[:, None] * v
 
     def largest_gap_here(self) -> float:
-        """Largest difference of a gap from that of its force, a length."""
-        return float(np.abs(self.gaps() - self._at)[self._stiffness > 0.0].max(initial=0.0)) if self._acts else 0.0
+        """Largest difference of a gap from that of its force, or between gaps from facets of a corner, a length."""
+        if not self._acts:
+            return 0.0
+        apart = self.kinematics.gap_rows.equations.gap[len(self.nodes) :]
+        return float(np.abs(np.append((self.gaps() - self._at)[self._stiffness > 0.0], apart)).max(initial=0.0))
 
     def displaced(self) -> float:
         """See ``Interface``."""
@@ -294,19 +319,23 @@ class SoftInterface(Interface):
     def follow(self) -> bool:
         """Release contactors past an end (collective); see ``Interface``."""
         pressing = replace(self.trial, active=self.united)
-        gone = bool((pressing.active & self.off).any())
-        self.kinematics, state = self.kinematics.follow(pressing, self.off)
+        gone, before = bool((pressing.active & self.off).any()), self.kinematics
+        self.kinematics, state = before.follow(pressing, self.off)
         self.trial = replace(state, active=self.trial.active)
-        return gone
+        if moved := self.kinematics is not before:
+            self._press()
+        return gone or moved
 
     # -- bodies that only contact holds ----------------------------------------------------------------------------------
 
     def equations(self) -> ContactRows:
-        """Rows of gaps that hold bodies, of which none is eliminated (collective)."""
-        which = np.flatnonzero(self._holds)
-        rows = self.kinematics.gap_rows.select(which, np.zeros(len(self.nodes), dtype=bool))
-        held = np.ones(len(rows), dtype=bool)
-        return replace(rows, kind=np.full(len(rows), -1), moved=None, resisted=held, crosswise=replace(rows.rows, active=held))
+        """Rows of gaps that hold bodies, of which only those along further axes of corners are eliminated (collective)."""
+        corner = self.trial.in_corner
+        rows = self.kinematics.gap_rows.select(np.flatnonzero(self._holds | corner), corner)
+        united, held = rows.kind > NORMAL, np.ones(len(rows), dtype=bool)
+        own = replace(rows.rows, active=united)
+        kind = np.where(united, rows.kind, -1)
+        return replace(rows, rows=own, kind=kind, moved=None, resisted=held, crosswise=replace(own, active=held))
 
     @property
     def approach(self) -> tuple[Ints, UnitingEquations]:
@@ -344,7 +373,7 @@ class SoftInterface(Interface):
     def restore(self) -> None:
         """See ``Interface``."""
         super().restore()
-        self._predicted = None
+        self._predicted, self._settled = None, False
 
     def from_checkpoint(self, kept: Mapping[str, npt.NDArray[Any]]) -> None:
         """See ``Interface``; pressures with damping are those of the state's own time (collective)."""
