@@ -13,10 +13,14 @@ import uem_dolfinx as uem
 COMM = MPI.COMM_WORLD
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-def test_no_references_in_circles(degree):
+@pytest.mark.parametrize(
+    ("degree", "how"),
+    [(1, {}), (2, {}), (1, {"normal": uem.SoftContact(1e3)}), (1, {"cohesion": uem.Cohesive(1.0, 0.1)})],
+    ids=["1", "2", "soft", "cohesive"],
+)
+def test_no_references_in_circles(degree, how):
     b = blocks(COMM, "triangle", 4, 3, gap=0.1, overhang=0.5, degree=degree, pose=arch(0.3, 0.45))
-    contact = uem.Contact(b.high, b.low, max_penetration=0.2)
+    contact = uem.Contact(b.high, b.low, max_penetration=0.2, **how)
     bcs = [*clamp(b.V, b.bottom), *clamp(b.V, b.top, value=[0.0, -0.15])]
     problem = uem.UnitedProblem(st_venant(b.u, modulus(b.scene, 1.0, 2.0)), b.u, bcs=bcs, contacts=[contact])
     run(problem, 2)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, cast
+from weakref import proxy
 
 from mpi4py import MPI
 
@@ -180,7 +181,8 @@ class ConcaveEdges:
     """Follows contactors from facet to facet of a target with the facets' own normals, and holds them in its concave edges."""
 
     def __init__(self, of: OnTarget):
-        self._of, self.config, self.target = of, of.config, cast("MeshTarget", of.target)
+        # the discretisation has these edges
+        self._of, self.config, self.target = proxy(of), of.config, cast("MeshTarget", of.target)
 
     def place(self, nearest: Projection, points: Array, state: PairState) -> tuple[Projection, Corners | None]:
         """Project contactors held in corners onto these; contactors that change facets too often get averaged normals (collective).

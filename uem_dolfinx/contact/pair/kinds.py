@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import proxy
 
 from uem_dolfinx.arrays import Indices
 from uem_dolfinx.contact.pair.interface import Interface
@@ -61,7 +62,8 @@ def kind_of_interface(contact: Any, duration: Callable[[], float] | None) -> Cal
         from uem_dolfinx.contact.pair import adhesive, cohesive
 
         kind = cohesive.CohesiveInterface if contact.cohesion.bonds else adhesive.AdhesiveInterface
-    return partial(kind, law=law, contact=contact)
+    # the contact has the pair
+    return partial(kind, law=law, contact=proxy(contact))
 
 
 def heats_of_kind(contact: Any, pair: Interface) -> list[Heat]:

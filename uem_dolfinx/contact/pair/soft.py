@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
+from weakref import proxy
 
 from mpi4py import MPI
 
@@ -112,7 +113,8 @@ class SoftInterface(Interface):
         self._damped: tuple[Array, Array, Array] | None = None
         if isinstance(self.discretisation, NodeToSurface):
             # also at corners of bodies in general contact: those opposite do not press
-            self.discretisation.follow_by(_Corners(self.discretisation, lambda: self._settled))
+            own = proxy(self)
+            self.discretisation.follow_by(_Corners(self.discretisation, lambda: own._settled))
         n = len(self.nodes)
         # surfaces that are far apart at the start have a state of damping, too
         damping = np.tile([np.inf, 0.0, np.inf, 0.0, float(contact._at)], (n, 1)) if law.damping else None
