@@ -81,7 +81,7 @@ class Power(given.Sealed):
         return (((1.0 - share) / opening) ** self.a + (share / shear) ** self.a) ** (-1.0 / self.a)
 
 
-AT_LEAST_ONE = given.Range("a number of 1 or more", lambda x: x >= 1)
+AT_LEAST_ONE = given.Range("a finite number of 1 or more", lambda x: 1 <= x < np.inf)
 
 
 #: The strength that is left under plastic unloading is found by so many of Newton's steps, which converge monotonically.

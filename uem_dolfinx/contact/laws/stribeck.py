@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from uem_dolfinx import given
 from uem_dolfinx.arrays import Array
+from uem_dolfinx.contact.laws.law import given_field
 
 
 @dataclass(frozen=True, init=False)
@@ -118,7 +119,7 @@ class ViscousFriction:
     timed = True
 
     def __init__(self, eta: float | Callable[..., npt.ArrayLike], *, mu: float = np.inf):
-        object.__setattr__(self, "field", eta if given.function(eta) else given.number("eta", eta, given.NOT_NEGATIVE))
+        object.__setattr__(self, "field", given_field("eta", eta, given.NOT_NEGATIVE))
         object.__setattr__(self, "mu", given.number("mu", mu, given.POSITIVE_OR_INFINITE))
 
     def limit(self, value: Array, lam: Array, area: Array) -> tuple[Array, Array]:
