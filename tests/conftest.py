@@ -75,6 +75,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     quick, most, every, start = (config.getoption(name) for name in ("--cases", "--most", "--every", "--start"))
     files = defaultdict[Path, dict[str, list[pytest.Item]]](dict)
     for item in items:
+        if MPI.COMM_WORLD.size == 1 and item.get_closest_marker("long") is not None:
+            item.add_marker("slow")
         files[item.path].setdefault(item.nodeid.partition("[")[0], []).append(item)
     runs = set()
     for tests in files.values():

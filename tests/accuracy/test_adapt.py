@@ -50,6 +50,7 @@ def test_a_sharp_corner():
     assert "estimate" in str(found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degree, quads", [slow(1, 0), (2, 0), slow(2, 1)])
 def test_sizes_for_a_tolerance(degree, quads):
     """The tolerance is met, and not by far, with triangles and with quadrilaterals."""

@@ -99,6 +99,7 @@ def test_friction(mu, pushed, dim, degree, coupling, finer):
         assert 0.45 < found.error / (rubbing_exact(mu, pushed, dim)[name] - found.value) < 1.3, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling, dim", [("mortar", 2), slow("node_to_surface", 2), slow("node_to_surface", 3)])
 def test_normals_that_turn(coupling, dim):
     """Where all contactors slip, estimates are the changes to the solution of one degree more on the same mesh, to 20 %.
@@ -210,6 +211,7 @@ CASES = [
 FAST = CASES[0], CASES[15]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scene, n, degree, coupling, finer", [case if case in FAST else slow(*case) for case in CASES])
 def test_effectivity(scene, n, degree, coupling, finer):
     """Estimates have the sign of the error, and 0.5 to 1.5 of its size, for forces, displacements and stresses."""

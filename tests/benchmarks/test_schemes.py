@@ -6,6 +6,7 @@ import pytest
 from benchmarks.schemes import WAYS, run
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_errors_of_schemes(dim):
     rule, _, explicit, massy = ([run(dim, cells, way) for cells in (8, 16)] for way in WAYS)

@@ -259,6 +259,7 @@ def test_a_rigid_block_without_stiffness(side):
     assert push[1] == pytest.approx(-0.02, rel=1e-8) and turn == pytest.approx(0.001, rel=1e-7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", [{}, slow({"petsc_options": {"ksp_type": "cg", "pc_type": "hypre"}})])
 def test_moments_about_fixed_axes(how):
     """The end of a bar turns by more than a right angle about three axes: quadratic convergence, and the same end whatever the steps."""

@@ -264,6 +264,7 @@ def test_a_plane_problem_beside():
     assert uem.integrate(fem.Constant(plane.mesh, 1.0) * ufl.dx) == pytest.approx(6.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
 def test_checkpoints(coupling, folder):
     """A run with plasticity and friction that was left continues from its file as it would have; not as one with another law."""

@@ -158,6 +158,7 @@ def test_rotation(coupling):
     assert contact.resultant().force[0] == pytest.approx(pulls[-1], rel=1e-3)
 
 
+@pytest.mark.long
 def test_friction_on_the_damaged_part():
     """Pressed and sheared until the bond is gone: in the end the shear is mu N, and before the cohesion adds what is left of it."""
     mu, press = 0.5, 0.002

@@ -136,6 +136,7 @@ def test_which_facet_a_contactor_came_over():
             assert (c.slid_over(np.full(len(way), before), facets, way) == expected).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degree, friction", [(1, 0.0), (1, 0.2), pytest.param(2, 0.0, marks=pytest.mark.slow)])
 def test_a_concave_edge_that_ends_with_its_target(degree, friction):
     """A ridge is pushed along a groove and out of it: contactors that have passed its end carry nothing, moments balance."""

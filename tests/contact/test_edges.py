@@ -44,6 +44,7 @@ def test_one_force_wherever_the_nodes_are(on_edge):
     assert np.ptp(forces) < 0.004 * forces[0]
 
 
+@pytest.mark.long
 def test_two_beams_in_a_row():
     """With cells of degree 2 the force is that of two beams, but for what clamping stiffens."""
     forces = []
@@ -81,6 +82,7 @@ def test_roofs(cell, degree):
         assert r.n_crossings == 1 and r.force[2] < 0.0 and side(r.force) < most
 
 
+@pytest.mark.long
 def test_action_and_reaction():
     """Forces and moments on both bodies cancel, and so do those at the nodes."""
     r = rods((11, 12), length=12.0, angle=1.0, along=(0.7, 1.3), on_edge=False, law=st_venant, friction=0.2)
@@ -123,6 +125,7 @@ def test_coulomb(on_edge):
     assert side(r.force) == pytest.approx(mu, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_newton_is_quadratic(friction):
     """With the curvature of crossings, at large bending."""

@@ -179,6 +179,7 @@ def of_folded(shift, **how):
     return COMM.allreduce(r.contact.force.x.array.reshape(-1, 3)[:n][low].sum(axis=0)) @ r.R, r
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", [{}, slow({"friction": 0.3, "way": (0.1, 0.05, -0.1), "law": st_venant})])
 def test_edges_of_one_body(how):
     """A body that is folded onto itself has the forces of two bodies, in any pose, with nodes at its crossings and without."""

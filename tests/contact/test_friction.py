@@ -327,6 +327,7 @@ def test_going_on_from_a_checkpoint(cell, rigid, folder):
         assert whole.problem.u.x.array.tobytes() == second.problem.u.x.array.tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_iterative_solvers(cell):
     """Where contactors slip, GMRES with the multigrid of P'KP takes the place of CG, and finds the same."""

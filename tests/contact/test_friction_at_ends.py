@@ -45,6 +45,7 @@ def rows_of(equations, n):
     return A.reshape(len(equations), -1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("half", "n", "friction"), [(False, 4, 0.9), (True, 5, 0.9), pytest.param(True, 4, 0.9, marks=pytest.mark.slow)]
 )
@@ -74,6 +75,7 @@ def test_forces_are_those_of_all_equations(half, n, friction):
     assert np.abs(tau * share[:, None] - state.friction.tau)[stick].max() <= 1e-7 * largest
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("half", [False, True])
 def test_ends_on_any_number_of_ranks(half):
     """The same displacement and friction, and Newton's method stays quadratic."""

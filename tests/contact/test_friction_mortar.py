@@ -59,6 +59,7 @@ def test_a_flat_block_slides_at_mu_times_its_load(cell, degree, n):
     assert balance.force <= 1e-12 and balance.moment <= 1e-12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", slow("tetrahedron"), slow("hexahedron")])
 def test_friction_holds_a_block_of_degree_2(cell):
     """Pushed with less than mu times its weight it stays where it is; weight, push and friction balance."""
@@ -73,6 +74,7 @@ def test_friction_holds_a_block_of_degree_2(cell):
         assert balance.force <= 1e-12 and balance.moment <= 1e-7
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["tetrahedron", slow("hexahedron")])
 @pytest.mark.parametrize("degree", [1, slow(2)])
 def test_a_target_that_ends_over_facets_that_stick(cell, degree):

@@ -19,6 +19,7 @@ COUPLINGS = ["node_to_surface", "mortar"]
 MU = 0.3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("coupling", "centre"), [("node_to_surface", (0.0, 0.0)), ("node_to_surface", (1.1, 0.05)), ("mortar", (1.0, 0.0))]
 )
@@ -60,6 +61,7 @@ def test_a_slender_block_on_a_turntable(mu, press, law, centre):
     assert scene.states[0] > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_block_on_a_belt(coupling):
     """It is taken along with mu g until it is as fast as the belt: a few iterations a step, none of them cut."""

@@ -46,6 +46,7 @@ def test_an_edge_slides_along_a_groove(coupling, angles):
     assert highest(scene.problem.comm, np.abs(along + MU * scene.contact.pressures)) <= 1e-9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("coupling", "angle", "roof"),
     [("mortar", 30.0, False), ("mortar", 35.0, True), ("node_to_surface", 55.0, False), ("node_to_surface", 45.0, True)],

@@ -74,6 +74,7 @@ def pushed(contact, before):
     return out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "across"),
     [("triangle", 0.0), *(pytest.param("tetrahedron", across, marks=pytest.mark.slow) for across in (0.0, 0.05))],

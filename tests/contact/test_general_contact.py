@@ -91,6 +91,7 @@ def test_a_small_block_on_a_large_one(cell, n, mu):
     assert np.abs(u - v).max() < 1e-10 and np.abs(force - other).max() < 1e-10 * np.abs(force).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows,columns,end", [(2, 1, 0.12), slow(3, 2, 0.6)])
 def test_discs_in_motion(rows, columns, end):
     """Every step, iteration and displacement is that of pairs declared by hand."""

@@ -244,6 +244,7 @@ def test_before_a_problem():
 # -- steps -------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degree", [1, slow(2)])
 def test_going_on_from_a_checkpoint(degree, folder):
     """A run that is left while discs touch, and continued, is the run that was not left."""
@@ -262,6 +263,7 @@ def test_going_on_from_a_checkpoint(degree, folder):
     close(v, z)
 
 
+@pytest.mark.long
 def test_a_plate_is_not_passed():
     """A step that leads a disc through a thin plate is refused as that of hand-declared surfaces; one step ends where many do."""
     forces = []

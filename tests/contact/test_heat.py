@@ -247,6 +247,7 @@ def test_heat_of_friction(coupling, h):
     assert rubbing.contact.heat_balance() < 1e-13
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("h", [slow(lambda p, g: 2.0 * p + 0.1 / (1.0 + g)), np.inf])
 def test_going_on_from_a_checkpoint(folder, h):
     """The rest is what it would have been, flux and all, which is among the results; a run with another share is refused."""

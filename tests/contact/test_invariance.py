@@ -99,6 +99,7 @@ def test_rotation(reference, case, angle):
     assert turned["iterations"][-1] == reference[case]["iterations"][-1]
 
 
+@pytest.mark.long
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(st.floats(-3.1, 3.1), st.floats(-5, 5), st.integers(0, 1000))
 @example(0.2680489901632064, 0.0, 8)

@@ -91,6 +91,7 @@ def test_blocks_in_a_grid(cell, counts, mu, normals, monkeypatch):
         alike(one, other)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mu", [0.0, 0.3])
 def test_discs_in_motion(mu, monkeypatch):
     """Discs that fall and collide: steps, iterations, active contactors and displacements; most contacts are far apart."""

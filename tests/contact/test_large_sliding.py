@@ -81,6 +81,7 @@ def test_small_sliding_searches_once_a_step(cell, coupling):
     assert finite > 0 and abs(fine - finite) < 0.7 * abs(coarse - finite)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "normals"),
     [

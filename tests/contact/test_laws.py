@@ -105,6 +105,7 @@ def test_coulomb_with_a_limit(cell, degree, rigid, coupling):
         np.testing.assert_allclose(limited, other, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_law_from_outside():
     """What the package's own law says, a law of the user's says as well, where some contactors are below the limit and others at it."""
     for press in (0.006, 0.01, 0.014):

@@ -69,6 +69,7 @@ class Balls:
         return self.tag(np.concatenate([tag.entities for tag in tags]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("n", "seed"), [(3, 0), (4, 0), (4, 20)])
 def test_a_ball_on_three(n, seed):
     """Facets at 30 to 60 degrees, none of them covered altogether: Newton is quadratic, and forces balance."""
@@ -109,6 +110,7 @@ def test_rows_do_not_depend_on_the_active_set():
     pair.trial = start
 
 
+@pytest.mark.long
 def test_ranks_do_as_one_on_a_ball():
     """Histories and forces are those of one rank."""
 

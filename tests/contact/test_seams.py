@@ -164,6 +164,7 @@ def test_where_the_seam_is(how):
         alike(first, slab([start], FLAT, **how))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [

@@ -128,6 +128,7 @@ def test_prongs_of_other_kinds(cell, degree, normals):
     assert farthest(U) == pytest.approx(farthest(W), rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [
@@ -173,6 +174,7 @@ def test_prongs_in_flight(how):
     assert closed >= 3 and np.abs(momenta - momenta[0]).max() < 1e-12 * size
 
 
+@pytest.mark.long
 def test_order_of_the_input():
     """Any order of nodes and cells gives the same displacements, to rounding."""
     ends = [farthest(closed("triangle", shuffle=seed)[2]) for seed in (None, 1)]

@@ -31,6 +31,7 @@ def cantilevers(w=-28.0, contactor="A", **how):
     return uem.UnitedProblem(F, u, bcs=bcs, contacts=contacts, rtol=1e-11), tags
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("steps", [28, pytest.param(45, marks=pytest.mark.slow)])
 def test_departure(steps):
     """Wherever the stations are: in contact up to the end, then in one uncut step to the state that was never in contact."""
@@ -75,6 +76,7 @@ def test_reactions_beside_contact():
     assert np.abs(problem.reaction(b.bottom)).max() < 1e-12
 
 
+@pytest.mark.long
 def test_definite_past_the_limit_point():
     """The united tangent stays positive definite where the load is largest, and past it."""
     problem, tags = cantilevers(-14.0)
@@ -88,6 +90,7 @@ def test_definite_past_the_limit_point():
     assert loads[-1] > min(loads)
 
 
+@pytest.mark.long
 def test_point_as_contactor(tmp_path):
     """A point has a force but no pressure, and the picture shows its force."""
     problem, _ = cantilevers(-5.0)

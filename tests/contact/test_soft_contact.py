@@ -120,6 +120,7 @@ def test_the_limit_is_hard_contact(coupling, degree):
     assert errors[2] == pytest.approx(errors[1] / 100, rel=0.1) and errors[3] < 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("contactors", ["massless", "massy"])
 def test_frequency_on_a_contact_stiffness(contactors):
     """A stiff mass on a soft contact swings about its rest with the period 2 pi sqrt(m / (k A)), and loses no energy."""
@@ -158,6 +159,7 @@ def test_a_load_cycle_is_elastic(law):
     assert states[4:-1] == [pytest.approx(state, rel=1e-8) for state in states[2::-1]]
 
 
+@pytest.mark.long
 def test_prongs_of_one_body():
     """A fork that is pressed together touches itself by a pressure, which tends to hard contact, and forces balance."""
 
@@ -253,6 +255,7 @@ def test_a_run_that_continues(folder):
     assert rest == pytest.approx(whole[2:], rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("general", [True, slow(False)])
 def test_damped_surfaces_that_are_far_apart_at_first(general, folder):
     """The flight before does not change how a damped block meets another, and a run that stops on the way continues as the whole one."""

@@ -111,6 +111,7 @@ def test_harmless_scenes(name, caplog):
     assert problem.contacts[0].n_active and not reported(caplog)
 
 
+@pytest.mark.long
 def test_a_corner_that_is_dragged(caplog):
     """Without friction the drag vanishes; the slab's nodes leave some, and a warning says why. The die's nodes, with mortar, do not."""
     assert np.abs(ironing(1)).max() > 0.08 and len(reported(caplog)) == 1

@@ -169,6 +169,7 @@ def saddle_point(cell, n_low, n_high, ratio, d):
         active[np.flatnonzero(active)[lam.argmin()]] = False
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
 @few
 @given(n_low=st.integers(1, 5), n_high=st.integers(1, 5), ratio=st.sampled_from([0.1, 1.0, 10.0]))
@@ -212,6 +213,7 @@ def overlapping(cell, n, overlap):
     assert drawn.force[-1] > 0.3 * overlap
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell,n",
     [
@@ -281,6 +283,7 @@ def nudged(nudge, *, height=0.0, cell="triangle", normals="facet", law="finite",
     return contact.resultant().force, s.gather(u), count
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell,normals,height,law",
     [
@@ -305,6 +308,7 @@ def test_contactor_next_to_a_vertex(cell, normals, height, law):
         assert abs(there[2] - count) <= 5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_contactor_next_to_a_ridge(law):
     """On a convex polygon facet normals jump, and which side of a ridge a contactor comes to rest on is no matter of much force."""

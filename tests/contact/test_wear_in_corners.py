@@ -129,6 +129,7 @@ def test_strokes_over_an_elastic_floor(cell, how, corners):
     assert (held > 0) == corners
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["quadrilateral", slow("hexahedron")])
 def test_strokes_with_friction(cell):
     """The sum over contactors of k times force times slip, which is less than the way of the block."""
@@ -161,6 +162,7 @@ def test_a_block_that_slides_against_a_wall(cell, how, steps):
         assert b.stroke(place)[0] / b.unit / force[-1] == pytest.approx(way, abs=error)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "how"),
     [

@@ -85,6 +85,7 @@ def test_steps_that_go_on(folder):
 SLIDES = [([0.2, 0.2, 0.1], 0.2, {3: 0.1}), ([0.0, 0.3, 0.3], 0.0, {2: 0.3}), ([0.4, 0.4, 0.0], 0.4, {3: 0.0})]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("expected", "mu", "changes"), SLIDES)
 @pytest.mark.parametrize("how", ["SURFACE TO SURFACE", "NODE TO SURFACE"])
 @pytest.mark.parametrize("soft", [False, True])
@@ -199,6 +200,7 @@ def test_gaps_that_conduct(folder):
         assert (ran(folder, text).temperature(121) > 101.0) is hot
 
 
+@pytest.mark.long
 def test_heat_in_steps_of_time(folder):
     """Steps grow by a half, to a tenth of the whole, and end with it."""
     text = two(material=STEEL + HEAT.format(1.0), step=f"*STEP\n*HEAT TRANSFER\n0.02, 1.0\n{ENDS}", held=BOTH)

@@ -39,6 +39,7 @@ def swing(tolerance, dt=0.32, end=1.28, scheme=None):
     return lengths, abs(phase[1] - phase[0]) / (omega * end)
 
 
+@pytest.mark.long
 def test_a_vibration():
     """The error of the period is the tolerance, nearly; steps are as long as this allows, and powers of two."""
     counts = []

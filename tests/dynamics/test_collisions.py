@@ -123,6 +123,7 @@ def harmless(path, error):
 RATIOS = [(1e-3, 1e-3), (1e-3, 1.0), (1.0, 1e-3), (1.5, 1.5), (1.0, 1e3), (1e3, 1.0), (1e3, 1e3)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mass", "stiffness", "block"),
     [
@@ -139,6 +140,7 @@ def test_a_block_lands_on_a_rod(mass, stiffness, block):
         assert late.mean() == pytest.approx(1.0, abs=0.07) and late.std() < 0.11
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cfl", [pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_shorter_steps_are_no_worse(cfl):
     """The case that won 549 % with the block's face as contactor; energy and the mean stress for steps far below the limit."""
@@ -147,6 +149,7 @@ def test_shorter_steps_are_no_worse(cfl):
     assert path.stress[(path.ahead > 0.3) & (path.ahead < 0.95)].mean() == pytest.approx(1.0, abs=0.07)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mass", "stiffness"), [(0.01, 1.0), *(pytest.param(*how, marks=pytest.mark.slow) for how in ((0.1, 0.1), (0.3, 1.0)))]
 )
@@ -157,6 +160,7 @@ def test_a_light_block_leaves_again(mass, stiffness):
     assert path.stress.max() > 0.9 and path.stress[-1] == 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("ratio", "degree", "passes"),
     [

@@ -113,6 +113,7 @@ def test_damped_vibration():
     assert np.abs(np.array(speeds) - exact).max() <= 0.04 * down / w
 
 
+@pytest.mark.long
 def test_a_run_continues(folder):
     """From a checkpoint amid the impact a run continues to the last bit, with what has been dissipated, and a step is taken twice."""
 

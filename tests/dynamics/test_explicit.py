@@ -184,6 +184,7 @@ def test_a_step_assembles_nothing(monkeypatch):
     assert not made
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", [uem.LinearElastic, uem.NeoHooke])
 def test_a_surface_that_comes_and_goes(monkeypatch, law):
     """Where contact changes, the surface alone is factorised; its forces are those of the cells behind it, assembled without the others."""

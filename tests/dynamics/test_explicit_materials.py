@@ -49,6 +49,7 @@ class Bar:
         self.u, self.speed = u, speed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("law", [uem.VonMises, uem.FinitePlasticity])
 def test_the_plastic_wave(law, coupling):
@@ -255,6 +256,7 @@ def test_a_step_returns_stresses_once(monkeypatch):
     assert abs(bar.problem.materials[0].energy() / row.stored - 1.0) < 1e-12
 
 
+@pytest.mark.long
 def test_restart(tmp_path):
     """A run that continues from a checkpoint is the uninterrupted one to rounding, with the same steps."""
     path = COMM.bcast(str(tmp_path / "kept"))

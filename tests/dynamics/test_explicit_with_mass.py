@@ -98,6 +98,7 @@ def test_rows_of_an_energy_book_that_leaves_steps_out(how, dt):
     assert every.rows[-1].contact < -1e-2 * energy and struck > 0.2 * np.abs(every.impulses[-1]).max()
 
 
+@pytest.mark.long
 def test_what_is_lost_is_of_the_mesh():
     """Twice as many cells lose half as much energy."""
     lost = []
@@ -213,6 +214,7 @@ def test_discs_that_collide_off_centre(friction):
     assert 0.0 < 1.0 - (last.kinetic + last.stored) / book.rows[0].kinetic < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_a_block_slides_to_rest(coupling):
     """Friction stops a block with mu g, in closed form, and holds it."""

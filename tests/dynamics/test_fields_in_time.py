@@ -70,6 +70,7 @@ def test_a_pressure_that_changes_nothing(pressure):
     assert highest(COMM, np.abs(np.linalg.norm(there, axis=1).sum() - np.linalg.norm(own, axis=1).sum())) < 1e-12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how", [{"coupling": "mortar"}, *(slow({"coupling": "node_to_surface", "general": g}) for g in (False, True))], ids=str
 )

@@ -87,6 +87,7 @@ class Slider:
         return np.array(rows)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", [uem.Stribeck(0.5, 0.3), pytest.param(uem.Stribeck(0.5, 0.3, 0.01), marks=pytest.mark.slow)])
 def test_a_block_on_a_spring_sticks_and_slips(law):
     """Static and kinetic coefficients: period and reach of the limit cycle, each to what a step can tell.

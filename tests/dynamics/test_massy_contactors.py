@@ -151,6 +151,7 @@ def test_bars_never_gain_energy(ratio, cfl, how):
     assert np.abs(run.energy - run.start - run.contact).max() <= 1e-9 * run.start
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rho_inf", [0.8, slow(0.0)])
 def test_damped_steps_lose_more(rho_inf):
     """With the generalised-alpha method momentum balances by the same forces."""
@@ -173,6 +174,7 @@ def test_force_and_impulse_of_bars(ratio):
     assert lost[0] / lost[1] == pytest.approx(2.0, rel=0.02) and lost[0] < 0.4 / 8
 
 
+@pytest.mark.long
 def test_general_contact():
     """One declaration for both bars: its forces between them are the means over the steps."""
     bars = Bars(1.0, 1.0, general=True)
@@ -225,6 +227,7 @@ def test_units():
     assert np.abs(found[2] - found[0]).max() <= 1e-9 * np.abs(found[0]).max()
 
 
+@pytest.mark.long
 def test_the_same_on_any_ranks():
     runs = [
         (bars := Bars(1.0, 2.0, along=0.6, narrow=0.1, friction=0.3, comm=comm)).run(bars.echo.min())
@@ -234,6 +237,7 @@ def test_the_same_on_any_ranks():
     assert np.abs(runs[0].energy - runs[1].energy).max() <= 1e-11 * runs[1].start
 
 
+@pytest.mark.long
 def test_a_run_continues(folder):
     """A run that is interrupted in contact continues alike."""
     path, ends = folder / "run.h5", []
@@ -318,6 +322,7 @@ def test_a_bar_at_rest(scheme):
     assert highest(COMM, np.abs(bar.dynamics.velocity.x.array)) <= 1e-9 * 3.0 * 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("masses", [uem.lumped_mass, slow(uem.consistent_mass)])
 def test_a_block_on_a_belt(masses):
     """A block falls onto a belt: friction is mu times the force in every step that it slips, and in the end it moves with the belt."""

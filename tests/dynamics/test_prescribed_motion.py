@@ -148,6 +148,7 @@ def chain(mass, n, way, velocity):
     return at
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mass", MASSES)
 @pytest.mark.parametrize(
     "scheme, from_rest",

@@ -131,6 +131,7 @@ def test_damping_form(rate):
 # ---------------------------------------------------------------------------------------------- impact
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "mass"),
     [
@@ -156,6 +157,7 @@ def test_bar_hits_wall(cell, mass):
     assert np.allclose(p - p[0], impulses, atol=1e-9 * abs(p[0]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", [1e-9, pytest.param(1e3, marks=pytest.mark.slow)])
 def test_units(unit):
     """The same impact in nanometres and kilometres, with the density that keeps the wave's time."""
@@ -165,6 +167,7 @@ def test_units(unit):
     assert [s.newton_iterations for s in here.steps] == [s.newton_iterations for s in there.steps]
 
 
+@pytest.mark.long
 def test_linear_flight_assembles_once():
     """K is assembled once, and factored once, while nothing touches; so it is while the contact stays."""
     bar = Bar(20)
@@ -277,6 +280,7 @@ def test_a_blow_that_no_step_resolves_is_named(monkeypatch):
 # ---------------------------------------------------------------------------------------------- ranks, and what is refused
 
 
+@pytest.mark.long
 def test_ranks_see_the_same_motion():
     """Positions and forces of two colliding bodies on all ranks, and on one alone."""
     found = []

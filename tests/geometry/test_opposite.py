@@ -50,6 +50,7 @@ def test_facets_that_have_faced_each_other(angle, faces):
         assert (len(found.facet) > 0) == seen
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "gap", [0.0, pytest.param(0.05, marks=pytest.mark.slow), pytest.param(2.0, marks=pytest.mark.slow), 50.0]
 )

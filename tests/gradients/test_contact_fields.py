@@ -27,6 +27,7 @@ def rough(W):
     return f
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell, law", [("triangle", "neo"), slow("tetrahedron", "linear"), slow("hexahedron", "linear")])
 def test_by_friction(cell, law):
     """``J(h) - J(0) - h J'`` vanishes with h^2 for changes of the coefficient from node to node, and of the shape that takes it along."""
@@ -98,6 +99,7 @@ def test_sums_are_the_derivatives_by_a_uniform_change():
     assert dot(by, every) == pytest.approx(float(whole), rel=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell, degree, coupling", [("triangle", 1, "mortar"), slow("quadrilateral", 2, "node_to_surface")])
 def test_the_same_as_functions_of_position(cell, degree, coupling):
     """A Function and the function of position that it interpolates give the same state, with both couplings; new values are read."""

@@ -60,6 +60,7 @@ def test_a_tangent_that_is_not_symmetric():
     assert uem.integrate(ufl.derivative(J, b.u, du)) == pytest.approx(float(by), rel=1e-11)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", [pytest.param("node_to_surface", marks=pytest.mark.slow), "mortar"])
 def test_a_body_that_contact_alone_holds(coupling):
     """A block that lies on another by its weight stays where it is across it: derivatives along that motion are zero, others right."""

@@ -92,6 +92,7 @@ def changed(s, h):
     return value
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "displacement"), [("pressure", 1), ("temperature", 0), slow("temperature", 1)])
 def test_of_second_order_and_forward_as_backward(kind, displacement):
     """Taylor's test along all controls together; the adjoint's derivative is that of the unknowns and pressures, put into J."""

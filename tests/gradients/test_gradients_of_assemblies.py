@@ -25,6 +25,7 @@ def test_of_second_order(what):
     assert order(*scene(what)) >= 1.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", FEATURES)
 def test_histories_of_second_order(what):
     """All controls together, and functionals of all steps, which show what values have reached in each."""
@@ -59,6 +60,7 @@ IN_TIME = {"tie": (), "preload": ("force",), "shortening": ("shortening",), "equ
 IN_TIME |= {"force and spring at nodes": ("force at a node",)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", IN_TIME)
 def test_in_time(what):
     """Each control against central differences of all steps; forces act on the first acceleration, too."""

@@ -35,6 +35,7 @@ def changes(s, damped=True, shaken=False, **_):
     return some + ([(s.hand, s.way, wave(s.V, 0.1))] if shaken else [])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", SCENES)
 def test_of_second_order(how):
     """``J(h) - J(0) - h J'`` vanishes with h^2 where the same contactors touch in the same steps, and two ranks tell the same slope."""

@@ -36,6 +36,7 @@ def indented(cell, degree, n, hardening, depth=DEPTH):
     return steps, -contact.resultant().force[1] / (np.pi * radius**2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "degree", "n", "cuts"), [("quadrilateral", 1, 24, 0), slow("triangle", 2, 12, 1), slow("quadrilateral", 1, 40, 3)]
 )
@@ -47,6 +48,7 @@ def test_mean_pressure_without_hardening(cell, degree, n, cuts):
     assert sum(s.cuts for s in steps) <= cuts
 
 
+@pytest.mark.long
 def test_no_step_of_a_deep_indentation_is_cut():
     """Iterations whose full step runs past the least work are shortened; taken whole, they end in cuts."""
     steps, _ = indented("quadrilateral", 1, 24, 100.0, 4 * DEPTH)

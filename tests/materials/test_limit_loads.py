@@ -46,6 +46,7 @@ def test_linear_simplices_lock_as_documented(comm, cell):
     assert limit_load(comm, cell, 4, 1)[0] > 1.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, n, degree, error",
     [("quadrilateral", 8, 1, 0.056), ("quadrilateral", 4, 2, 0.042), ("triangle", 4, 2, 0.070), ("triangle", 8, 1, 0.24)],

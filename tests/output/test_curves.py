@@ -57,6 +57,7 @@ def test_histories(run):
     assert picture.png.startswith(b"\x89PNG") if COMM.rank == 0 else not picture.png
 
 
+@pytest.mark.long
 def test_energies(folder):
     """A block that swings freely: the sum is constant, and drawn from the log and from its file alike."""
     b = blocks(COMM, "triangle", 2, 2)

@@ -237,6 +237,7 @@ def frames(path):
     return COMM.bcast(Image.open(path).n_frames if COMM.rank == 0 else None)
 
 
+@pytest.mark.long
 def test_frames_of_a_film(folder, monkeypatch):
     """One for each step, all with the same window and the same colours, and the steps come as they would."""
     problem, bounds = pressed(COMM, "triangle"), []
@@ -367,6 +368,7 @@ def test_panels_and_their_letters(folder):
     raised(uem.InputError, "columns", lambda: uem.figure(folder / "a.png", COMM, columns=0).__enter__())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wide", [False, True])
 def test_colour_bars_are_as_long_as_the_scene(folder, wide):
     """To the right of a scene, above it if it is flat, although the panel has another shape."""

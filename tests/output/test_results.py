@@ -238,6 +238,7 @@ def test_nodal_average_is_taken_in_each_body(cell: str) -> None:
     np.testing.assert_allclose(values[cells], np.where(b.scene.body == 0, 3.0, 7.0)[:, None] * np.ones(cells.shape[1]))
 
 
+@pytest.mark.long
 def test_ranks_without_a_cell_write_along(folder: Path) -> None:
     """One cell for all ranks: results and a picture as one rank makes them, and a checkpoint that one rank continues from."""
 

@@ -120,6 +120,7 @@ with uem.ResultsWriter(here / "run", problem, vtx=False, resume={resume}) as wri
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(COMM.size > 1, reason="starts processes of its own")
 @pytest.mark.parametrize("killed", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_two_processes(killed, folder):

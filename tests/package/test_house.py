@@ -119,7 +119,7 @@ def test_imports_point_one_way():
 #: What may not grow: a commit that needs more raises the number, and gives the reason and what it removed.
 BUDGETS = {
     "members of the seam": 26, "members of Interface": 49, "heuristics": 12, "arrows within contact": 70, "arrows within solve": 35,
-    "lines of the package": 60027,
+    "lines of the package": 60086,
 }  # fmt: skip
 
 
@@ -267,7 +267,11 @@ def test_versions_are_known_to_compat_alone():
     """Nowhere else in the package, the demos and the tests; ``demos/benchmarks/measure.py`` says what was measured where."""
     asking = set()
     for path in python_files("uem_dolfinx", "demos", "tests"):
-        if any(map(asks_for_a_version, ast.walk(ast.parse(path.read_text(encoding="utf-8"))))):
+        text = path.read_text(encoding="utf-8")
+        # most files have none of these words, and need no tree
+        if re.search("version|VERSION|hasattr|getattr|AttributeError", text) and any(
+            map(asks_for_a_version, ast.walk(ast.parse(text)))
+        ):
             asking.add(path.relative_to(REPOSITORY).as_posix())
     assert asking - {"demos/benchmarks/measure.py"} == {"uem_dolfinx/compat.py"}
 

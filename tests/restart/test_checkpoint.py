@@ -217,6 +217,7 @@ def test_states_of_contacts_find_their_facets(cell, chunk, folder, monkeypatch):
             assert all(COMM.allgather(good))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "normals"),
     [
@@ -320,6 +321,7 @@ def test_multigrid_continues_too(folder):
     assert np.abs(u - v).max() <= (0.0 if COMM.size == 1 else 1e-8 * np.abs(u).max())
 
 
+@pytest.mark.long
 def test_falling_body_continues(folder):
     """A body that only contact holds: where it is supported against neutral motions does not depend on earlier steps."""
 

@@ -223,6 +223,7 @@ def test_a_signal_within_a_step_waits_for_its_end(folder):
     assert end.value.code == 143 and there.numbers["step"] == 2
 
 
+@pytest.mark.long
 @serial
 def test_terminated(folder):
     """SIGTERM ends a run with 143 after its step is written, far from the end of the interval."""

@@ -243,6 +243,7 @@ def same(own, whole, scale=1e-10):
     assert np.abs(a - b).max() <= scale * np.abs(b).max() > 0.0
 
 
+@pytest.mark.long
 @meetings
 def test_units(make):
     """In nanometres and gigapascals, and in kilometres, bodies move as in units of one, in as many steps and iterations."""
@@ -258,6 +259,7 @@ def test_units(make):
         assert np.abs(u - reference).max() <= 1e-9 * np.abs(reference).max()
 
 
+@pytest.mark.long
 @meetings
 def test_gone_on_with(make, tmp_path):
     """A run that stops in mid-way, and continues in a new problem, ends as the one left alone."""

@@ -118,6 +118,7 @@ def test_a_later_end(folder):
     same_tables(uninterrupted()[2], folder)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("writer, reader", [(MPI.COMM_SELF, COMM), (COMM, MPI.COMM_SELF)], ids=["one to all", "all to one"])
 def test_ranks_change(writer, reader, folder):
     """Written by one rank and read by all, and the reverse: velocities and plastic history find their places."""

@@ -58,6 +58,7 @@ def kept(kind, folder):
     return there.problem.progress.steps
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "stops", [*(pytest.param(n, marks=pytest.mark.slow) for n in ((3,), (3, 2, 1)) if COMM.size == 1), (4, 1)], ids=str
 )
@@ -77,6 +78,7 @@ def test_interrupted_is_uninterrupted(kind, stops, folder):
     same_end(kind, last, folder)
 
 
+@pytest.mark.long
 def test_scenes_have_what_they_are_made_for():
     """Steps that are cut, two calls, plastic flow."""
     assert sum(s.cuts for s in uninterrupted("sliding")[1]) > 2
@@ -110,6 +112,7 @@ def test_begun_by_the_load_steps(folder):
     assert reported(end) == reported(uninterrupted("ramped")[1][4:])
 
 
+@pytest.mark.long
 def test_read_back(folder):
     """A state that is read back in the same run is continued from by the next call."""
     one = RAMPS["loaded"](COMM)

@@ -100,6 +100,7 @@ def turning(tolerance, path, by="values", comm=COMM):
     return comm.allreduce(flows.peeq.x.array.max(initial=0.0), op=MPI.MAX), steps
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("by", ["values", slow("coupling"), slow("offset")])
 def test_a_load_that_turns(by):
     """To and fro within a part of a step, with zeros at its ends and middle: the halves alone would not see it."""

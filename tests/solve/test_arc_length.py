@@ -95,6 +95,7 @@ def test_a_step_that_fails_after_an_unstable_equilibrium_says_so():
     assert False in reported and True in reported
 
 
+@pytest.mark.long
 def test_arch_snaps_through():
     """Its load goes up to the limit, down, up again, and by the floor to its end: every state is in equilibrium under its load."""
     arch = Arch(rtol=1e-10, n=20)

@@ -306,6 +306,7 @@ def test_a_stiff_block_is_dragged_over_a_soft_one_and_back(cell, n, ratio, mu, c
     assert sum(d.states) > 0 and force[0] * force[-1] != 0
 
 
+@pytest.mark.long
 def test_a_body_that_friction_does_not_hold_is_refused_soon():
     """Pushed a little harder than friction bears, a block leads to the same states again: the error takes 200 linear solves at most."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [2.0, 0.5], [8, 2])])

@@ -59,6 +59,7 @@ def led(make, failing, way=WAY, made=()):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in SCENES])
 def test_a_failed_attempt_leaves_nothing(name):
     """Lists, segments, anchors, facets, limits and whatever else an attempt changes come back: the next step starts from the last one."""

@@ -336,6 +336,7 @@ def heated(mu=0.3):
     return uem.UnitedProblem(F, f.w, displacement=1, bcs=bcs, contacts=[c]), c
 
 
+@pytest.mark.long
 def test_going_on_from_a_checkpoint(folder):
     """The rest of the steps is what it would have been: to the last bit on one rank, but for MUMPS' order of messages on several."""
     problem, contact = heated()

@@ -240,6 +240,7 @@ def reference():
     return answers
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_units(reference, law):
     """Nanometres and kilometres, soft and stiff: the same answer in the same iterations."""

@@ -41,6 +41,7 @@ def test_linear_body_assembles_its_tangent_once():
     assert contact.n_active > 0
 
 
+@pytest.mark.long
 def test_solves_on_the_way_are_as_accurate_as_newton_needs():
     """Looser solves take less than nine tenths of the linear iterations of solves to 1e-8, and at most 15 % more Newton iterations."""
 

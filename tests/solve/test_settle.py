@@ -184,6 +184,7 @@ def test_slots_are_for_contactors_within_reach():
         assert (near == reached).all()
 
 
+@pytest.mark.long
 def test_time_steps_with_friction_begin_on_arrays(monkeypatch):
     """Discs that fall and slide move as by exchanges alone, of which arrays save most."""
 

@@ -106,6 +106,7 @@ def test_a_step_that_is_left_continues_with_what_is_left():
         assert column.forces()[0] == pytest.approx(pressed * 2 / 3 * (1 - step.factor), abs=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stops", [slow((3,)), (6, 2)], ids=str)
 def test_interrupted_is_uninterrupted(stops, folder):
     """Left in the middle of a step, and continued by the same script: the same numbers, in serial bit by bit; results continue."""

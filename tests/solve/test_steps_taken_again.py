@@ -82,6 +82,7 @@ def same(ours, theirs, part=1e-9):
         assert highest(COMM, np.abs(a - b)) <= part * max(highest(COMM, np.abs(b)), 1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FAMILY)
 def test_a_field_that_changes_within_the_step(name):
     """Solved again with the right field, a step is the one that would have been made with it, histories among it."""

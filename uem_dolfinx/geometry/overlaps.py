@@ -25,11 +25,12 @@ STRAIGHT = 0.01
 #: Increase of the degree of quadrature where maps differ more, and products of shape functions are no polynomials.
 #: [convention; degree; test_overlaps.py::test_products_that_are_no_polynomials]
 BENT = 8
+#: Smaller corners of polygons are integrated by themselves. [convention; part of the polygon; test_overlaps.py::test_small_corners]
+SMALL_CORNER = 1e-3
 #: Newton iterations for the position of a point in the plane of a facet whose map is not affine. [bound; iterations; -]
 IN_MEAN_PLANE = 12
 
 
-Rule: TypeAlias = tuple[Array, Array]
 Facets: TypeAlias = tuple[FacetShape, Array]
 
 
@@ -85,18 +86,15 @@ class Segments:
     gap: Array  # distance from the contactor to the target along the contactor's normal ``(q,)``
 
 
-def quadrature(shape: FacetShape, straight: bool) -> tuple[Array, Array]:
-    """Rule for products of two shape functions on a piece of a facet: barycentric points ``(k, fdim + 1)`` and weights of sum 1.
+def degree_of_products(shape: FacetShape, straight: bool) -> int:
+    """Degree of products of two shape functions on a piece of a facet.
 
     Args:
         shape: of the facets.
         straight: whether the maps of both facets are affine, so that the products are polynomials.
     """
-    cell = "interval" if shape.dim == 1 else "triangle"
     # bilinear functions are of degree 2 along the diagonals
-    degree = 2 * shape.degree * (2 if shape.cell == "quadrilateral" else 1) + (0 if straight else BENT)
-    points, weights = forms.quadrature_rule(cell, degree)
-    return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
+    return 2 * shape.degree * (2 if shape.cell == "quadrilateral" else 1) + (0 if straight else BENT)
 
 
 def _straight(shape: FacetShape, y: Array) -> Bools:
@@ -129,8 +127,8 @@ def overlap(planes: Planes, contactor: Facets, target: Facets, sign: Array, face
     cut = _intervals if shape.dim == 1 else _polygons
     for kind in np.unique(straight) if len(straight) else (True,):
         which = np.flatnonzero(straight == kind)
-        rule = quadrature(shape, kind)
-        place, at, weight = cut(planes.take(which), (shape, own[which]), (other, its[which]), sign[which], rule)
+        degree = degree_of_products(shape, bool(kind))
+        place, at, weight = cut(planes.take(which), (shape, own[which]), (other, its[which]), sign[which], degree)
         parts.append((which[place], at, weight))
     place, at, weight = (np.concatenate(part) for part in zip(*parts))
     order = np.argsort(place, kind="stable")
@@ -147,19 +145,19 @@ def _box(places: Array) -> tuple[Array, Array]:
     return reduce(np.minimum, nodes), reduce(np.maximum, nodes)
 
 
-def _intervals(planes: Planes, contactor: Facets, target: Facets, sign: Array, rule: Rule) -> tuple[Ints, Array, Array]:
+def _intervals(planes: Planes, contactor: Facets, target: Facets, sign: Array, degree: int) -> tuple[Ints, Array, Array]:
     """Pairs, places in the plane ``(q, 1)`` and weights of the quadrature in 2D."""
-    its, (points, weights) = target[1], rule
+    its, (points, weights) = target[1], forms.quadrature_rule("interval", degree)
     ends = np.sort(its[:, :2, 0], axis=1)
     low, high = np.maximum(0.0, ends[:, 0]), np.minimum(planes.size, ends[:, 1])
     found = np.flatnonzero(high - low > SLIVER * planes.size)
-    s = low[found, None] * points[:, 0] + high[found, None] * points[:, 1]
+    s = low[found, None] * (1.0 - points[:, 0]) + high[found, None] * points[:, 0]
     return np.repeat(found, len(weights)), s.reshape(-1, 1), ((high - low)[found, None] * weights).ravel()
 
 
-def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, rule: Rule) -> tuple[Ints, Array, Array]:
+def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, degree: int) -> tuple[Ints, Array, Array]:
     """Pairs, places in the plane ``(q, 2)`` and weights of the quadrature in 3D."""
-    (shape, own), (other, its), (points, weights) = contactor, target, rule
+    (shape, own), (other, its) = contactor, target
     frame = own[:, shape.ring, :2]
     # counter-clockwise about the outward normal
     frame = np.where(sign[:, None, None] > 0, frame, frame[:, ::-1])
@@ -169,16 +167,73 @@ def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, ru
     corners, count = corners[found], count[found]
     if shape.affine and other.affine:
         polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
-        a, b, c = corners[polygon, 0], corners[polygon, first + 1], corners[polygon, first + 2]
+        pieces = [(polygon, corners[polygon[:, None], np.column_stack([0 * first, first + 1, first + 2])])]
     else:
-        # no rule is exact here: if sides coincide, one more sliver would change all triangles about a corner
-        i = np.arange(corners.shape[1])
-        polygon, first = np.nonzero(i < count[:, None])
-        after = np.where(i + 1 < count[:, None], i + 1, 0)
-        a, b, c = _centroids(corners, count)[polygon], corners[polygon, first], corners[polygon, after[polygon, first]]
-    area = 0.5 * np.abs(cross(b - a, c - a))
-    at = np.einsum("qk,kpg->pqg", points, np.stack([a, b, c]))
-    return np.repeat(found[polygon], len(weights)), at.reshape(-1, 2), (area[:, None] * weights).ravel()
+        pieces = _pieces(corners, count)
+    parts = [(of, *_rule(piece, degree)) for of, piece in pieces]
+    polygon = np.concatenate([np.repeat(of, weight.shape[1]) for of, _, weight in parts])
+    at, weight = (
+        np.concatenate(values) for values in ([at.reshape(-1, 2) for _, at, _ in parts], [w.ravel() for _, _, w in parts])
+    )
+    return found[polygon], at, weight
+
+
+def _rule(piece: Array, degree: int) -> tuple[Array, Array]:
+    """Places ``(p, q, 2)`` and weights ``(p, q)`` to integrate polynomials over triangles or convex quadrilaterals ``(p, 3 or 4, 2)``."""
+    if piece.shape[1] == 3:
+        points, weights = forms.quadrature_rule("triangle", degree)
+        sides = piece[:, 1:] - piece[:, :1]
+        return piece[:, :1] + points @ sides, np.abs(cross(sides[:, 0], sides[:, 1]))[:, None] * weights
+    # the area is of one degree more
+    points, weights = forms.quadrature_rule("quadrilateral", degree + 1)
+    start, side, across = piece[:, :1], (piece[:, 1] - piece[:, 0])[:, None], (piece[:, 3] - piece[:, 0])[:, None]
+    twist = (piece[:, 0] - piece[:, 1] + piece[:, 2] - piece[:, 3])[:, None]
+    x, y = points[:, :1], points[:, 1:]
+    area = np.abs(cross(side + y * twist, across + x * twist))
+    return start + x * side + y * across + x * y * twist, area * weights
+
+
+def _pieces(corners: Array, count: Ints) -> list[tuple[Ints, Array]]:
+    """Triangles and quadrilaterals of which polygons consist: numbers of polygons, and corners ``(p, 3, 2)`` and ``(p, 4, 2)``.
+
+    Where functions are no polynomials, integrals depend on the pieces. If sides of facets coincide, rounding makes one corner more or less,
+    which leaves all other pieces as they are.
+
+    Args:
+        corners: in either order ``(m, k, 2)``.
+        count: corners of each ``(m,)``.
+    """
+    corners, count, polygon, cut_off = _without_small_corners(corners, count)
+    few, many = np.flatnonzero(count <= 4), np.flatnonzero(count > 4)
+    threes, fours = few[count[few] == 3], few[count[few] == 4]
+    i = np.arange(corners.shape[1])
+    row, first = np.nonzero(i < count[many, None])
+    about = many[row]
+    after = np.where(first + 1 < count[about], first + 1, 0)
+    fan = np.stack([_centroids(corners[many], count[many])[row], corners[about, first], corners[about, after]], axis=1)
+    triangles = np.concatenate([cut_off, corners[threes, :3], fan])
+    return [(np.concatenate([polygon, threes, about]), triangles), (fours, corners[fours, :4])]
+
+
+def _without_small_corners(corners: Array, count: Ints) -> tuple[Array, Ints, Ints, Array]:
+    """Polygons without their small corners, their numbers of corners, and the triangles cut off with the polygons that they are of."""
+    corners, count, i = corners.copy(), count.copy(), np.arange(corners.shape[1])
+    area = _fan(corners, count)[0].sum(axis=1)
+    of, cut_off, left = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3, 2))], np.flatnonzero(count > 3)
+    while len(left):
+        some, number = corners[left], count[left]
+        after = _following(some, number)
+        before = some[np.arange(len(left))[:, None], np.where(i > 0, i, number[:, None]) - 1]
+        size = np.where(i < number[:, None], cross(some - before, after - some) / area[left, None], np.inf)
+        smallest = size.argmin(axis=1)
+        row = np.flatnonzero(size.min(axis=1) <= SMALL_CORNER)
+        at, left = smallest[row], left[row]
+        of.append(left)
+        cut_off.append(np.stack([before[row, at], some[row, at], after[row, at]], axis=1))
+        corners[left, :-1] = np.where((i[:-1] < at[:, None])[..., None], some[row, :-1], some[row, 1:])
+        count[left] -= 1
+        left = left[count[left] > 3]
+    return corners, count, np.concatenate(of), np.concatenate(cut_off)
 
 
 def clip(subject: Array, frame: Array) -> tuple[Array, Ints]:

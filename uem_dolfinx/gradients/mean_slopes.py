@@ -103,7 +103,7 @@ class MeanSlopes:
         found = -config.add_at_owners(*then.ties.handed_on(pulled))
         found[pair.nodes] = found[pair.nodes] @ self._turn
         assert then.rows.weights is not None
-        kept = Frictional(which, 0.0 * pulled[which], pulled[which], np.zeros(len(which), dtype=bool))
+        kept = Frictional(which, 0.0 * pulled[which], -pulled[which], np.zeros(len(which), dtype=bool))
         dofs = then.of.surface.dofs[then.rows.facets]
         parts = turning(then.of.elimination, then.rows, dofs, kept, then.rows.weights)
         nodes = np.concatenate([some.ravel() for some, _ in parts])

@@ -208,7 +208,7 @@ class MortarKinematics(PlacedOnTarget):
         kept = rows.covered[along.which]
         which = along.which[kept]
         frictional = Frictional(which, self.normal[which], along.tau[kept], ~along.held[kept])
-        return parts + [(nodes, -blocks) for nodes, blocks in turning(of.elimination, rows, dofs, frictional, rows.weights)]
+        return parts + turning(of.elimination, rows, dofs, frictional, rows.weights)
 
     def _with_areas(self, pressure: Array) -> list[tuple[Ints, Array]]:
         """What areas add to minus the second derivatives of mean gaps g under ``pressure (n,)``: ``p (grad a grad g' + grad g grad b')``.

@@ -55,17 +55,19 @@ def handing_on(at: SegmentPoints, traction: Array) -> list[tuple[Ints, Array]]:
     n, size = at.planes.normal[e], at.planes.size[e]
     motions = Motions(at.phi[q], at.N[q], s.gap[q] / size[pair], at.turning[e][pair])
     share, one = np.concatenate([at.phi[q], -at.N[q]], axis=1), np.ones(len(q))
+    width, (_, nc) = share.shape[1] * g, at.nodes.shape
     # all grow with the facet
-    blocks = sum_of_products(pair, one, share[:, :, None] * force[:, None], motions.of_area((n / size[:, None])[pair]), k)
+    grown = ((n / size[:, None])[:, None, None] @ at.turning[e]).reshape(k, 1, nc * g)
+    blocks = np.zeros((k, width, width))
+    blocks[:, :, : nc * g] = add_up(pair, (share[:, :, None] * force[:, None]).reshape(-1, width), k)[:, :, None] * grown
     if at.unequal:
         blocks += _stretched(at, traction, which, q, pair)
     if at.other is not None:
         tab = at.other.tabulate(s.eta[q])
         over = dual_tangents(tangents(tab, at.y[which][pair]), n[pair])
         for f in range(at.other.dim):
-            moved = np.zeros((len(q), share.shape[1], g))
-            moved[:, motions.nc :] = -tab.dN[:, :, f, None] * force[:, None]
-            blocks += sum_of_products(pair, one, moved, motions.along(over[:, f]), k)
+            moved = -tab.dN[:, :, f, None] * force[:, None]
+            blocks[:, nc * g :] += sum_of_products(pair, one, moved, motions.along(over[:, f]), k)
     made = [(np.concatenate([at.nodes[e], at.opposite[which]], axis=1), blocks)]
     return made if at.other is None else made + _at_ends(at, at.other, traction)
 
@@ -181,7 +183,9 @@ def row_slopes(elimination: Elimination, rows: WeightedRows, which: Ints, unit: 
 def turning(
     elimination: Elimination, rows: WeightedRows, dofs: Indices, frictional: Frictional, weights: Terms
 ) -> list[tuple[Ints, Array]]:
-    """Derivatives of friction forces, at constant coefficients for slipping contactors and constant multipliers for others (collective).
+    """Minus the derivatives of friction forces (collective).
+
+    Coefficients are constant for slipping contactors, multipliers for others.
 
     Args:
         elimination: of the contactors.
@@ -201,8 +205,8 @@ def turning(
     along = made.longer * (frictional.slips / rows.push[which])[:, None, None]
     across = np.einsum("kg,kcgh->kch", tau, made.normal)
     change = np.einsum("kg,kch->kgch", tau, along - made.whole / whole[:, None]) - np.einsum("kg,kch->kgch", normal, across)
-    blocks = np.einsum("ka,kgch->kagch", made.weight, change).reshape(k, c * g, c * g)
-    return [*handing_on(rows.points, there[:, :, 1:]), (made.nodes, blocks)]
+    blocks = np.einsum("ka,kgch->kagch", -made.weight, change).reshape(k, c * g, c * g)
+    return [*handing_on(rows.points, -there[:, :, 1:]), (made.nodes, blocks)]
 
 
 def at_facets(elimination: Elimination, rows: WeightedRows, dofs: Indices, which: Ints, tau: Array) -> tuple[Array, Array]:
