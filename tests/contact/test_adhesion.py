@@ -159,6 +159,25 @@ def test_what_is_refused():
     refused(uem.InputError, "strength", lambda: uem.Adhesion(1.0, 0.0))
 
 
+@pytest.mark.parametrize("coupling", ["mortar", "node_to_surface"])
+@pytest.mark.parametrize("L", [1.0, 1e-6])
+def test_ranges_within_which_surfaces_touch(coupling, L):
+    """Refused if below 1e-9 of the model's size: attraction would never act."""
+    b = blocks(COMM, "quadrilateral", 2, 3, pose=lambda x: L * x)
+
+    def problem(part):
+        law = uem.Adhesion(0.5 * part * L * np.sqrt(5.0), 1.0)
+        return uem.UnitedProblem(
+            linear(b.u, 1e3, 0.0),
+            b.u,
+            bcs=clamp(b.V, b.bottom),
+            contacts=[uem.Contact(b.high, b.low, cohesion=law, coupling=coupling)],
+        )
+
+    refused(uem.InputError, ("high on low", "count as touching", "smaller strength"), lambda: problem(0.5e-9))
+    assert problem(2e-9).contacts[0].cohesion.range == pytest.approx(2e-9 * L * np.sqrt(5.0))
+
+
 @pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron")])
 def test_the_tangent_by_mortar(cell):
     """Across open gaps of arched surfaces that slide, stiffness and curvature are the derivative of the attraction."""

@@ -362,7 +362,7 @@ def test_what_does_not_go_is_refused(what):
 @pytest.mark.parametrize("contactors", ["massless", "massy"])
 @pytest.mark.parametrize("soft", [0, 1])
 def test_what_explicit_steps_would_hide_is_refused(contactors, soft):
-    """A negative modulus in one of two bodies, and load steps: each by its name, with nothing moved."""
+    """A negative modulus in one of two bodies, load steps and an equilibrium: each by its name, with nothing moved."""
     s = scene(COMM, "quadrilateral", [box("quadrilateral", [0.0, 0.0], [1.0, 10.0], [1, 12]),
                                       box("quadrilateral", [0.0, 10.1], [1.0, 20.0], [1, 12])])  # fmt: skip
     V = compat.function_space(s.mesh, 1, (2,))
@@ -374,8 +374,10 @@ def test_what_explicit_steps_would_hide_is_refused(contactors, soft):
     dynamics = uem.Dynamics(uem.lumped_mass(V, 1.0), scheme=uem.CentralDifferences(), contactors=contactors)
     contact = uem.Contact(s.tag("up", 1, at(1, 10.1)), s.tag("low", 0, at(1, 10.0)))
     problem = uem.UnitedProblem(form, u, contacts=[contact], dynamics=dynamics)
-    with pytest.raises(uem.InputError, match="load_steps does not go with CentralDifferences"):
+    with pytest.raises(uem.InputError, match="load_steps are for statics"):
         uem.load_steps(problem, 2)
+    with pytest.raises(uem.InputError, match="solve.. does not go with CentralDifferences"):
+        problem.solve()
     sign.value = -1.0
     with pytest.raises(uem.InputError, match="tangent of the bodies is indefinite"):
         next(uem.time_steps(problem, end=0.1))

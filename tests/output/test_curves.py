@@ -88,6 +88,9 @@ def test_energies(folder):
 
 def test_refused(run):
     folder, writer = run
+    if COMM.rank == 0:
+        (folder / "empty.csv").write_text("")
+    COMM.barrier()
     for error, words, call in (
         (uem.InputTypeError, ("source = 3", "read_results"), lambda: uem.plot_history(3)),
         (uem.InputError, ("columns = 'force_z'", "did you mean"), lambda: uem.plot_history(writer, columns="force_z")),
@@ -95,6 +98,7 @@ def test_refused(run):
         (uem.InputError, "expected the name of a column", lambda: uem.plot_history(writer, columns=[])),
         (uem.InputTypeError, "columns[0] = 3", lambda: uem.plot_history(writer, columns=[3])),
         (uem.InputError, ("no column 'time'", "EnergyBook"), lambda: uem.plot_energies(writer)),
+        (uem.InputError, "no column of numbers", lambda: uem.plot_history(folder / "empty.csv")),
         (uem.MissingFileError, "there are no results", lambda: uem.plot_history(folder / "other.csv")),
     ):
         refused(error, words, call)

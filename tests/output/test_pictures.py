@@ -179,6 +179,20 @@ def test_arguments_of_other_dimensions(monkeypatch, folder):
         "field": [],
     }.items():
         refused(uem.InputError, name, lambda name=name, value=value: uem.plot_scene(flat, folder / "a.png", **{name: value}))
+    for how in (
+        {"levels": 257},
+        {"levels": range(300)},
+        {"size": (1e6, 1e6)},
+        {"size": (1e-9, 1.0)},
+        {"dpi": 1e7},
+        {"dpi": 1e-9},
+    ):
+        expected = "256 colours" if "levels" in how else "16384 on a side"
+        refused(uem.InputError, expected, lambda how=how: uem.plot_scene(flat, folder / "a.png", **how))
+    refused(uem.InputError, "a point in each panel", lambda: uem.figure(folder / "a.png", COMM, 10**7).__enter__())
+    refused(uem.InputError, "16384 on a side", lambda: uem.figure(folder / "a.png", COMM, 400, size=(50, 50)).__enter__())
+    refused(uem.InputError, "16384 on a side", lambda: uem.animate(folder / "a.gif", flat, [], size=(1e6, 1e6)))
+    refused(uem.InputTypeError, "picture = 3", lambda: uem.plot_scene(flat, 3))
     for name in ("mirror", "cells", "arrows", "rigid", "triad"):
         draw = partial(uem.plot_scene, flat, folder / "a.png", **{name: "no"})
         refused(uem.InputTypeError, (f"{name} = 'no'", "True or False"), draw)

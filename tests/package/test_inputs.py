@@ -20,6 +20,7 @@ from uem_dolfinx import compat, forms, given
 
 COMM = MPI.COMM_WORLD
 LAST = COMM.rank == COMM.size - 1
+several = pytest.mark.skipif(COMM.size == 1, reason="one rank")
 nan, inf = np.nan, np.inf
 
 
@@ -225,12 +226,7 @@ def test_surface_of_an_unknown_tag():
 @pytest.mark.parametrize(
     "option, value, error, words",
     [
-        (
-            "sliding",
-            "infinite",
-            uem.InputError,
-            ("sliding = 'infinite'", "'finite', 'small' or 'fixed'", "did you mean 'finite'?"),
-        ),
+        ("sliding", "infinite", uem.InputError, ("sliding = 'infinite'", "'finite', 'small' or 'fixed'", "you mean 'finite'?")),
         ("sliding", True, uem.InputTypeError, ("sliding = True", "'finite'")),
         ("normals", "smooth", uem.InputError, ("normals = 'smooth'", "'facet' or 'averaged'")),
         ("max_penetration", nan, uem.InputError, ("max_penetration = nan", "0 or a positive length")),
@@ -255,14 +251,13 @@ def test_rigid_contactor():
     refused(uem.InputTypeError, ("contactor = a RigidPlane", "swap"), lambda: uem.Contact(uem.RigidPlane((0, 0), (0, 1)), b.low))
 
 
+@several
 @pytest.mark.parametrize(
     "options",
     [{"rtol": 1e-7 if LAST else 1e-8}, {"max_iterations": 20 + LAST}, {"newton": "modified" if LAST else "full"}],
     ids=str,
 )
 def test_what_differs_from_rank_to_rank(options):
-    if COMM.size == 1:
-        pytest.skip("one rank")
     (option,) = options
     refused(
         uem.InputError, (f"{option} = ", f"on rank {COMM.size - 1}", "the same on all ranks"), lambda: pressed(scene(), **options)
@@ -270,6 +265,39 @@ def test_what_differs_from_rank_to_rank(options):
     ball = uem.RigidSphere((0.5, -1.0), 1.0 + 0.1 * LAST)
     b = scene()
     refused(uem.InputError, ("rigid sphere", "on rank 0"), lambda: pressed(b, contacts=[uem.Contact(b.high, ball)]))
+
+
+@several
+@pytest.mark.parametrize("what", ["exclude", "order", "self_contact", "bodies", "rigid", "friction"])
+def test_a_general_contact_that_differs(what):
+    b = scene()
+    one = {
+        "bodies": {"top": b.high},
+        "rigid": [uem.RigidPlane((0, -5), (0, 1))],
+        "friction": {("body 1", "body 2"): 0.3, None: 0.1},
+    }
+    contact = uem.GeneralContact(**({what: one.get(what, [b.high])} if LAST else {}))
+    refused(uem.InputError, (f"{what} = ", "the same on all ranks"), lambda: pressed(b, contacts=[contact]))
+
+
+@several
+@pytest.mark.parametrize("what", ["load", "checkpoint", "estimate", "every"])
+def test_steps_that_differ(what):
+    """Loads, checkpoints and estimates that one rank alone has, when the problem is made or later."""
+    b, words = scene(), (f"{what} = ", "the same on all ranks")
+    one = {"load": {constant(b, 0.0): 1.0}, "checkpoint": uem.Checkpoint("never.uem"), "estimate": lambda problem: None}
+    how = {what: one.get(what)} if LAST else {}
+    if what == "load":
+        refused(uem.InputError, words, lambda: pressed(b, **how))
+        problem = pressed(b)
+        problem.load = (lambda s: None) if LAST else None
+        refused(uem.InputError, words, lambda: uem.load_steps(problem))
+    elif what == "every":
+        kept = uem.Checkpoint("never.uem", every=1 + LAST)
+        refused(uem.InputError, words, lambda: uem.load_steps(pressed(b), checkpoint=kept))
+        refused(uem.InputError, words, lambda: uem.animate("never.gif", pressed(b), [], every=1 + LAST))
+    else:
+        refused(uem.InputError, words, lambda: uem.load_steps(pressed(b), **how))
 
 
 # -- rigid surfaces ----------------------------------------------------------------------------------------------------

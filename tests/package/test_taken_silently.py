@@ -109,6 +109,16 @@ CASES = {
 }  # fmt: skip
 
 
+def in_time(steps):
+    """Load steps of a problem with inertia."""
+    b = blocks(COMM, "triangle", 2, 2)
+    how = {"bcs": b.oedometer(0.01), "dynamics": uem.Dynamics(uem.lumped_mass(b.V, 1.0), contactors="massy")}
+    uem.load_steps(uem.UnitedProblem(linear(b.u, 1.0), b.u, contacts=[uem.Contact(b.high, b.low)], **how), steps)
+
+
+CASES |= {f"load steps in time, {n}": (uem.InputError, "load_steps are for statics", lambda n=n: in_time(n)) for n in (2, [])}
+
+
 @pytest.mark.parametrize("what", CASES)
 def test_named(what):
     error, words, call = CASES[what]

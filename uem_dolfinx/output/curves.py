@@ -58,6 +58,8 @@ def plot_history(
     comm, known = _columns_of(source)
     with agreed(comm):
         numbers = {name: values for name, values in known.items() if values.dtype.kind == "f"}
+        if not numbers:
+            raise InputError("source has no column of numbers: expected the table of a run with steps")
         over = next((name for name in ("time", "factor") if name in numbers), None) if over is None else over
         given.word("over", over, list(numbers))
         columns = [columns] if isinstance(columns, str) else columns

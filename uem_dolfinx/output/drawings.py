@@ -32,6 +32,10 @@ NO_PRESSURE, RIGID = "#d2d2d2", "#b2b2b2"
 BAR_ABOVE = 1.8
 #: Colour of contact forces, which viridis does not have.
 FORCE = "#d62728"
+#: Largest number of colours, as many as colour maps have. [format; colours; -]
+COLOURS = 256
+#: Largest side of a picture: a square of this side takes 1 GB. [bound; points; -]
+LARGEST = 2**14
 FIELD = "a scalar expression, a contact or several, or None for the size of the displacement"
 
 
@@ -57,6 +61,8 @@ class Drawing:
                 levels = given.count("levels", levels)
             elif len(levels) < 2 or not (np.diff(given.vector("levels", levels, len(levels))) > 0).all():  # type: ignore[arg-type]
                 raise InputError(given.sentence("levels", levels, "the number of colours, or two or more bounds that grow"))
+            if (levels if isinstance(levels, int) else len(levels) - 1) > COLOURS:
+                raise InputError(given.sentence("levels", levels, f"no more than {COLOURS} colours"))
             if isinstance(field, (list, tuple)) and len(field):
                 pressed = bool(given.items("field", field, lambda one: isinstance(one, Contact | ManyContacts), "a contact"))
             elif not (field is None or pressed or getattr(field, "ufl_shape", None) == ()):
@@ -116,11 +122,17 @@ def checked_window(gdim: int, window: Sequence[float] | None) -> Array | None:
     return ends
 
 
-def checked_size(size: Any) -> tuple[float, float]:
-    """Width and height of a picture in inches, with the errors of ``plot_scene``."""
+def checked_size(size: Any, dpi: float, rows: int = 1, columns: int = 1) -> tuple[float, float]:
+    """Width and height in inches of a panel of a picture with ``rows`` and ``columns``, with the errors of ``plot_scene``."""
     width, height = given.vector("size", size, 2)
     if not min(width, height) > 0:
         raise InputError(given.sentence("size", size, "a positive width and height in inches"))
+    across, high = columns * width * dpi, rows * height * dpi
+    if min(width, height) * dpi < 1.0 or max(across, high) > LARGEST:
+        raise InputError(
+            f"size = {given.shown(size)} makes a picture of {across:.4g} by {high:.4g} points: expected at most {LARGEST} on a side, and "
+            "a point in each panel at least; take another size or dpi, or other numbers of panels"
+        )
     return float(width), float(height)
 
 

@@ -67,11 +67,12 @@ def animate(
             raise InputError(given.sentence("path", str(path), "a name that ends in .gif or .mp4"))
         given.kind("steps", steps, hasattr(steps, "__iter__"), "steps, as load_steps(problem, 20)")
         every = given.count("every", every)
-        size = checked_size(size)
+        size = checked_size(size, 100)
         rate = given.number("frames_per_second", frames_per_second, given.POSITIVE)
         known = {name: value for name, value in (plot_scene.__kwdefaults__ or {}).items() if name not in ("size", "dpi")}
         for name in how:
             given.word("argument of animate", name, ("every", "frames_per_second", "size", *known))
+    given.alike(problem.comm, "animate", every=every, frames_per_second=rate, size=size)
     on_rank_0(problem.comm, f"the film {path} cannot be written", lambda: _prepare(path))
     return _film(path, Drawing(problem, **(known | how)), steps, every, rate, size)
 

@@ -28,6 +28,7 @@ from uem_dolfinx.solve.problem import UnitedProblem
 PAGE = 10.0
 #: Margin of a picture. [format; inches; -]
 MARGIN = 0.1
+PICTURE = "the name of a picture, an open file, or a panel of uem.figure"
 
 
 class Picture:
@@ -94,13 +95,15 @@ def figure(
         OutputError: if the picture cannot be written.
         Exception: any error of drawing on rank 0, on all ranks.
     """
+    given.kind("comm", comm, isinstance(comm, MPI.Comm), "a communicator, as problem.comm")
     with agreed(comm):
         drawn = path is not None and comm.rank == 0
         dpi = given.number("dpi", dpi, given.POSITIVE)
         panels = given.count("panels", panels)
         columns = panels if columns is None else min(panels, given.count("columns", columns))
         rows, share = -(-panels // columns), PAGE / columns
-        width, height = checked_size((min(6.4, share), min(4.8, 1.2 + 0.55 * share)) if size is None else size)
+        size = (min(6.4, share), min(4.8, 1.2 + 0.55 * share)) if size is None else size
+        width, height = checked_size(size, dpi, rows, columns)
         canvas = new_canvas(f"the picture {path}", (columns * width, rows * height)) if drawn else None
         if canvas is not None and isinstance(path, (str, Path)):
             _check_ending(path, list(canvas.canvas.get_supported_filetypes()))
@@ -144,7 +147,7 @@ def panel_of(
             yield panel
     else:
         with agreed(comm):
-            yield picture
+            yield given.kind("picture", picture, picture is None or hasattr(picture, "get_window_extent"), PICTURE)
 
 
 def _image_width(panel: Any) -> int:

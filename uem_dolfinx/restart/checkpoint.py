@@ -297,10 +297,12 @@ class Checkpoint(given.Sealed):
             Whether the state has been read from the file.
 
         Raises:
+            InputError: if its arguments differ between ranks.
             CheckpointError: if the file is damaged or belongs to another run, or if the checkpoint has begun with the state of
                 another problem.
         """
         given.kind("state", state, isinstance(state, State), "a State, as problem.state()")
+        given.alike(state.comm, "Checkpoint", path=str(self.path), every=self.every)
         if self._state is not None:
             self.check(*state.functions.values())
         self._state, comm, found = state, state.comm, False

@@ -74,6 +74,13 @@ def check_load(load: Any) -> Mapping[fem.Constant, Any] | ByFunction | None:
     return load if load is None or isinstance(load, ByFunction) else ByFunction(load)
 
 
+def words_of(load: Any) -> Any:
+    """A load as checked, in words that are the same on all ranks."""
+    if isinstance(load, Mapping):
+        return ["a function" if callable(value) else given.plain(value) for value in load.values()]
+    return load and "a function"
+
+
 def set_loads(comm: MPI.Comm, load: Any, at: float, bcs: Sequence[Any] = ()) -> None:
     """Apply a problem's ``load``, and Dirichlet values by rules, at a load factor or time; None sets nothing (collective).
 

@@ -89,6 +89,10 @@ def take_alone(problem: Any, start: Array | None, fraction: float) -> list[Itera
     """
     progress, dynamics = problem.progress, problem.dynamics
     with agreed(problem.comm):
+        if is_explicit(dynamics):
+            raise InputError(
+                "solve() does not go with CentralDifferences: take time_steps, or leave dynamics out for an equilibrium"
+            )
         if problem.impacts is not None:
             problem.impacts.refuse_statics()
         fraction = given.number("fraction", fraction, given.Range("a number from 0 to 1", lambda x: 0 <= x <= 1))

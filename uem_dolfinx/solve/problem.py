@@ -26,7 +26,7 @@ from uem_dolfinx.geometry.surfaces import surface_nodes
 from uem_dolfinx.geometry.tags import Part, as_tag
 from uem_dolfinx.parallel import agreed
 from uem_dolfinx.restart.interruption import end_together
-from uem_dolfinx.solve import checks
+from uem_dolfinx.solve import checks, loading
 from uem_dolfinx.solve.bodies.bodies import Bodies, configured, solver_of
 from uem_dolfinx.solve.bodies.field_scales import Norm
 from uem_dolfinx.solve.loading import check_load, forget_load, ramped, reactions, refuse_idle, set_loads, taken_by, values_at
@@ -166,7 +166,7 @@ class UnitedProblem(given.Sealed):
         given.alike(
             self.comm, "UnitedProblem", bcs=len(bcs), contacts=[contact.name for contact in contacts], materials=len(self.materials),
             equations=[type(one).__name__ for one in equations], points=[type(one).__name__ for one in points],
-            couplings=[one.name for one in linked],
+            couplings=[one.name for one in linked], load=loading.words_of(self.load), dynamics=type(dynamics).__name__,
             J=J is None, jit_options=jit_options, newton=loop.method, **{k: v for k, v in vars(loop).items() if k != "method"},
         )  # fmt: skip
         #: Contacts as declared, and, below, their parts: a general contact consists of several.

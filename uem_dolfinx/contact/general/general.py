@@ -20,9 +20,9 @@ from uem_dolfinx import given
 from uem_dolfinx.arrays import Array, Bools, Indices, Ints
 from uem_dolfinx.contact.contact import BOUND, COUPLINGS, MAX_PENETRATION, Contact
 from uem_dolfinx.contact.general.parts import AmongContact, MortarContact, RigidContact
-from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border
+from uem_dolfinx.contact.general.surface import as_part, is_pair, touching_surface, where, with_border, words_of
 from uem_dolfinx.contact.laws.conductance import Conductance, conductances_of, one_of_fields
-from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, given_normal
+from uem_dolfinx.contact.laws.law import Field, FrictionLaw, as_law, given_friction, given_normal, parameters
 from uem_dolfinx.contact.results import ManyContacts, Resultant, not_attached, sum_up
 from uem_dolfinx.errors import InputError, SurfaceError
 from uem_dolfinx.geometry.configuration import Configuration
@@ -153,6 +153,13 @@ class GeneralContact(ManyContacts, given.Sealed):
         from uem_dolfinx.geometry.skin import Skin, names_of_bodies
 
         self.taken, self._attached = True, config
+        given.alike(
+            config.comm, self.name, surfaces=words_of(self.surfaces), exclude=list(map(words_of, self.exclude)),
+            order=list(map(words_of, self.order)), bodies=[(name, words_of(part)) for name, part in self.bodies.items()],
+            self_contact=self.self_contact if isinstance(self.self_contact, bool) else list(map(words_of, self.self_contact)),
+            rigid=[type(one).__name__ for one in self.rigid], coupling=self.coupling,
+            friction=None if self._pairs is None else [(*map(words_of, pair), parameters(law)) for *pair, law in self._pairs.pairs],
+        )  # fmt: skip
         alone = [one for one in self.exclude if not is_pair(one)]
         pairs = [one for one in self.exclude if is_pair(one)]
         others = [c for c in others if not hasattr(c.target, "project")]

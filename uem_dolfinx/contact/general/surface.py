@@ -24,6 +24,13 @@ def is_pair(one: Any) -> bool:
     )
 
 
+def words_of(part: Any) -> Any:
+    """A part, a pair of parts or a name in words that are the same on all ranks: the name, or the class of what has none."""
+    if is_pair(part):
+        return [words_of(one) for one in part]
+    return part if isinstance(part, str) else getattr(part, "name", type(part).__name__)
+
+
 def _n_sides(config: Configuration) -> int:
     """Number of facets of a cell."""
     return len(forms.reference_topology(compat.cell_name(config.mesh))[config.tdim - 1])

@@ -306,7 +306,8 @@ class Adhesion(given.Sealed):
             ``energy E* / strength^2``, which cells must resolve.
 
     Raises:
-        InputError, InputTypeError: for numbers that are not positive.
+        InputError, InputTypeError: for numbers that are not positive; when the problem is made, for a range within which surfaces count
+            as touching, 1e-9 of the model's size.
     """
 
     bonds = False  #: Whether surfaces are bonded point to point.
@@ -319,9 +320,13 @@ class Adhesion(given.Sealed):
         """With its numbers."""
         return f"Adhesion({self.energy:g}, {self.strength:g})"
 
+    @property
+    def range(self) -> float:
+        """Gap at which the attraction ends, a length."""
+        return 2.0 * self.energy / self.strength
+
     def attraction(self, gap: Array) -> tuple[Array, Array]:
         """Attractions, and their derivatives by the gap, at gaps ``(n,)``; constant below zero, where contact closes the gap."""
-        reach = 2.0 * self.energy / self.strength
-        within = (gap > 0.0) & (gap < reach)
-        t = self.strength * np.clip(1.0 - gap / reach, 0.0, 1.0)
-        return t, np.where(within, -self.strength / reach, 0.0)
+        within = (gap > 0.0) & (gap < self.range)
+        t = self.strength * np.clip(1.0 - gap / self.range, 0.0, 1.0)
+        return t, np.where(within, -self.strength / self.range, 0.0)

@@ -16,8 +16,10 @@ from uem_dolfinx.arrays import Array, Bools, Ints
 from uem_dolfinx.contact.laws.soft import Adhesion
 from uem_dolfinx.contact.pair.cohesive import SofteningInterface, together
 from uem_dolfinx.contact.pair.soft import stiffness_of_gaps, traction_by_gaps
+from uem_dolfinx.contact.seam.active_set import TOUCHING
 from uem_dolfinx.contact.seam.placement import Traction
 from uem_dolfinx.contact.seam.state import PairState
+from uem_dolfinx.errors import InputError
 
 
 class AdhesiveInterface(SofteningInterface):
@@ -26,6 +28,11 @@ class AdhesiveInterface(SofteningInterface):
     def __init__(self, *args: Any, law: Adhesion, contact: Any, **how: Any):
         super().__init__(*args, **how)
         self._law, self._contact, n = law, contact, len(self.nodes)
+        if law.range < TOUCHING * self.config.size:
+            raise InputError(
+                f"{self.name}: {law!r} attracts over gaps up to {law.range:.3g}, but surfaces nearer than {TOUCHING:g} of the model's "
+                f"size, {TOUCHING * self.config.size:.3g}, count as touching: take a smaller strength, or leave cohesion out"
+            )
         # marks that forces follow a law; there is no damage
         self.trial = self.committed = replace(self.committed, cohesion=np.zeros((n, 2)))
         #: Multipliers of the rows of gaps, negative in attraction, and stiffnesses ``(n,)``.

@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from uem_dolfinx import given
-from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import ConvergenceError, InputError, UEMError
 from uem_dolfinx.log import progress as progress_bar
 from uem_dolfinx.parallel import agreed, ask_together
 from uem_dolfinx.solve import checks
+from uem_dolfinx.solve.loading import words_of
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.stepping import LoadStep, begin_checkpoint, between_steps
 from uem_dolfinx.solve.steps.by_load import ByLoad
@@ -54,7 +54,7 @@ def load_steps(
     Raises:
         InputError, InputTypeError: if ``steps`` is neither a positive whole number nor a list of ``Step``, or if a step is not of this
             problem. With ``arc_length`` if no load moves the bodies, if Dirichlet values do, for a list of ``Step``, or with ``tolerance``.
-            With ``tolerance`` while the problem is recorded. With central differences.
+            With ``tolerance`` while the problem is recorded. With dynamics.
         CheckpointError: see ``Checkpoint``.
         ConvergenceError, LinearSolveError, NotFiniteError, InvertedElementError, TunnellingError: if a step fails even at 1/1024 of its
             nominal length; the last converged state is kept.
@@ -62,8 +62,11 @@ def load_steps(
         KeyboardInterrupt, SystemExit: on all ranks, if any rank has received Ctrl-C or SIGTERM; the last converged state is kept.
     """
     check_steps(problem, checkpoint)
-    if is_explicit(problem.dynamics):
-        raise InputError("load_steps does not go with CentralDifferences: take time_steps, or leave dynamics out for statics")
+    if problem.dynamics is not None:
+        raise InputError(
+            "load_steps are for statics: leave dynamics out, or take time_steps and change loads in the loop over these; solve() finds an "
+            "equilibrium before time steps"
+        )
     several = isinstance(steps, Sequence) and not isinstance(steps, (str, bytes))
     with agreed(problem.comm):
         by = None
@@ -85,7 +88,10 @@ def load_steps(
             raise InputError("the problem is being recorded: leave tolerance out, and take as many steps as a run with it took")
         n = 0 if several else given.count("steps", steps, "or give a list of Step")
     given.kind("estimate", estimate, estimate is None or callable(estimate), "an ErrorLimit, or another function of the problem")
-    given.alike(problem.comm, "load_steps", steps=n, arc_length=repr(by or arc_length), tolerance=tolerance)
+    given.alike(
+        problem.comm, "load_steps", steps=n, arc_length=repr(by or arc_length), tolerance=tolerance, load=words_of(problem.load),
+        estimate=type(estimate).__name__, checkpoint=type(checkpoint).__name__,
+    )  # fmt: skip
     if isinstance(steps, Sequence):
         from uem_dolfinx.solve.steps.stages import check_stages
 

@@ -124,10 +124,6 @@ def check_stages(problem: UnitedProblem, steps: Sequence[Step]) -> None:
         given.items("steps", steps, lambda one: isinstance(one, Step), "a Step")
         if not steps:
             raise InputError("steps = []: expected one Step at least")
-        if problem.dynamics is not None:
-            raise InputError(
-                "steps are for statics: leave dynamics out, or take time_steps and change loads in the loop over these"
-            )
         if problem.load is not None:
             raise InputError("the problem has a load, which its steps do not use: leave load out, and give the steps their loads")
         if problem.history is not None:

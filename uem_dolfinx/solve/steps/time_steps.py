@@ -22,6 +22,7 @@ from uem_dolfinx.dynamics.scheme import is_explicit
 from uem_dolfinx.errors import InputError, NotFiniteError, PrecisionError, SpaceError, StepAccuracyError, UEMError
 from uem_dolfinx.log import logger, progress, say
 from uem_dolfinx.parallel import agreed, reduced
+from uem_dolfinx.solve.loading import words_of
 from uem_dolfinx.solve.problem import UnitedProblem
 from uem_dolfinx.solve.step_control import MENDABLE, REMAINDER, SHORTEST_LENGTH
 from uem_dolfinx.solve.stepping import TimeStep, begin_checkpoint, between_steps, events, touching
@@ -101,7 +102,10 @@ def time_steps(
         tolerance = None if tolerance is None else given.number("tolerance", tolerance, given.between(0.0, 1.0))
         if event_tolerance is not None:
             event_tolerance = given.number("event_tolerance", event_tolerance, given.between(0.0, 1.0))
-    given.alike(problem.comm, "time_steps", dt=dt, end=end, tolerance=tolerance, event_tolerance=event_tolerance)
+    given.alike(
+        problem.comm, "time_steps", dt=dt, end=end, tolerance=tolerance, event_tolerance=event_tolerance,
+        load=words_of(problem.load), checkpoint=type(checkpoint).__name__,
+    )  # fmt: skip
     if dt is not None:
         _check_length(dynamics, dt, end)
     begin_checkpoint(checkpoint, problem.state, problem.config.functions()["displacement"])
