@@ -73,6 +73,7 @@ def pressed(size):
     )
 
 
+@pytest.mark.long
 def test_a_contact_narrower_than_the_cells():
     """The second mesh improves little, since one node touches: the next ones are not finer than the tolerance needs."""
     found = uem.adapt(pressed, tolerance=0.02)
@@ -103,6 +104,7 @@ def test_a_large_tolerance():
     assert abs(force / exact - 1) < 0.05 and found.meshes[-1].cells < 4 * found.meshes[0].cells
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("quads, h, tolerance", [(0, 0.1, 0.035), slow(1, 0.2, 0.03)])
 def test_fewer_cells_than_at_first(quads, h, tolerance):
     """Of a fine uniform mesh most cells are merged, with a smaller error than before: fine cells far from the corner serve nothing."""
@@ -204,6 +206,7 @@ def fixed(size):
     return uem.UnitedProblem(F, u, bcs=bcs, contacts=[uem.Contact(tags["upper_bottom"], tags["lower_top"])])
 
 
+@pytest.mark.long
 def test_what_cannot_be_adapted():
     """Cells that the geometry fixes, and wrong arguments."""
     refused(uem.MeshError, ["Transfinite", "same 80 cells"], lambda: uem.adapt(fixed, tolerance=1e-4))

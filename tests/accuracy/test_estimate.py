@@ -32,6 +32,7 @@ def westergaard(n, degree, coupling, finer):
     return uem.error_estimate(problem), s.errors(problem, contact, steps)["error_energy"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("degree, finer", [(1, 1.0), (2, 2.0), slow(1, 2.0), slow(2, 1.0)])
 def test_effectivity(degree, finer, coupling):
@@ -55,6 +56,7 @@ def test_five_meshes(degree, finer, coupling):
     assert min(ratios) > 0.75 and max(ratios) < 1.1 * min(ratios) < 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("led", ["displacement", "force", "both"])
 def test_norm(led):
     """The norm of the displacement is the root of its work, ``u' K u``, however the body is loaded."""
@@ -132,6 +134,7 @@ def press(parameters, degree=1, coupling="mortar", scale=1.0, force=1.0, law=uem
     return uem.UnitedProblem(F, u, bcs=bcs, contacts=[uem.Contact(tags["upper_bottom"], tags["lower_top"], coupling=coupling)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degree", [1, 2])
 def test_patches_have_no_error(degree):
     """A constant stress passes a contact of meshes that do not match: contact tractions are estimated exactly on both sides."""
@@ -149,6 +152,7 @@ def bent(cell="triangle", degree=1, n=3, what="node_to_surface", law=st_venant, 
     return uem.UnitedProblem(F, b.u, bcs=clamp(b.V, b.bottom), contacts=[contact])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["node_to_surface", "mortar", "general"])
 @pytest.mark.parametrize("cell, degree", [("triangle", 1), ("quadrilateral", 2), slow("tetrahedron", 1), slow("hexahedron", 1)])
 def test_all_kinds(cell, degree, what):
@@ -165,6 +169,7 @@ def test_all_kinds(cell, degree, what):
     assert len(estimate.of_bodies) == 2 and estimate.of_bodies[0] != estimate.of_bodies[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale, force", [(1e-9, 1.0), (1e3, 1e9)])
 def test_units(scale, force):
     """The relative estimate does not depend on units."""
@@ -205,6 +210,7 @@ def test_steps_do_not_depend_on_estimates():
     assert np.allclose(ends[0], ends[1], rtol=0, atol=1e-15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["VonMises", "NeoHooke"])
 def test_other_laws(kind):
     """Bodies that yield and bodies of large strain: the estimate falls with the size of cells on a punch without a sharp corner."""

@@ -34,6 +34,7 @@ def blocks(n, dim=2, quads=0, degree=1, order=1, friction=0.0):
     return uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "dim, quads, degree, order", [(2, 0, 1, 1), slow(2, 1, 2, 1), slow(2, 1, 2, 2), (3, 0, 2, 2), slow(3, 1, 1, 1)]
 )

@@ -144,6 +144,7 @@ def test_five_meshes_of_a_tool_that_slips(folder):
             assert 0.5 < ratio < 1.3, (n, name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "degree, coupling, sliding", [(1, "mortar", "finite"), slow(2, "node_to_surface", "fixed"), slow(2, "mortar", "finite")]
 )
@@ -223,6 +224,7 @@ def test_effectivity(scene, n, degree, coupling, finer):
         assert 0.5 < ratio < 1.5, (name, ratio)
 
 
+@pytest.mark.long
 def test_few_facets_in_contact(caplog):
     """A warning where contact ends within a facet or two, and none where it has four, or covers the surface."""
     for scene, n, few in (("tilted", 2, True), ("tilted", 8, False), ("sharp", 2, False)):
@@ -242,6 +244,7 @@ def stacked_exact(dim, tied):
     return {k: 2 * v - coarse[k] for k, v in fine.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "dim, n_1, n_2, degree, tied, coupling, quads",
     [
@@ -263,6 +266,7 @@ def test_ties_and_space(dim, n_1, n_2, degree, tied, coupling, quads):
         assert 0.5 < found.error / (stacked_exact(dim, tied)[name] - found.value) < 1.5, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degree, coupling", [(1, "node_to_surface"), (2, "mortar")])
 def test_partitions(degree, coupling):
     """The estimate and its largest part do not depend on the number of ranks."""
@@ -348,6 +352,7 @@ def test_errors_that_cancel():
     assert 0.5 * tolerance < last.parts <= 2 * tolerance and last.estimate <= tolerance
 
 
+@pytest.mark.long
 def test_goals_of_zero():
     """The force on a wall that nothing touches is rounding: it has no relative error, and no mesh is made for it."""
     seal = Seal(wall=2.0)
@@ -376,6 +381,7 @@ def test_patches_have_no_error(degree):
     assert uem.goal_error(problem, force(F, tags["upper_top"])).relative < 1e-5
 
 
+@pytest.mark.long
 def test_units_and_strain():
     """The relative estimate does not depend on units of length, and large strain is estimated as small strain where it is small."""
     found = []

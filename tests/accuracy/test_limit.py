@@ -26,6 +26,7 @@ def sheared():
     return uem.UnitedProblem(linear(b.u, modulus(b.scene, 1.0, 1.0), 0.0), b.u, bcs=bcs, contacts=[contact])
 
 
+@pytest.mark.long
 def test_a_warning_where_the_bound_is_exceeded(caplog):
     """Once, in the step that exceeds it, with a place; estimates are those of error_estimate, and steps are the same."""
     limit, problem, alone = uem.ErrorLimit(0.05), sheared(), sheared()

@@ -72,6 +72,7 @@ def bent(x):
 KINDS = [("triangle", 1), ("quadrilateral", 1), ("triangle", 2), ("quadrilateral", 2)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, degree, n",
     [(*kind, 8) for kind in KINDS]
@@ -109,6 +110,7 @@ def test_linear_stresses(cell):
     assert np.allclose(found.stress, found.recovered, rtol=0, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("degree, finer", [(1, 2.0), (2, 1.0), slow(1, 1.0), slow(2, 2.0)])
 def test_contact(degree, finer, coupling):
@@ -205,6 +207,7 @@ def column(how, comm=COMM, scale=1.0, n=6):
     return problem
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["function", slow("tags"), slow("material")])
 def test_laws_that_jump(how):
     """Patches end where the law does: a stress that jumps there has no error."""
@@ -268,6 +271,7 @@ def test_steps_and_meshes():
     refused(uem.InputError, ["by", "recovery"], lambda: uem.ErrorLimit(0.1, by="recovered"))
 
 
+@pytest.mark.long
 def test_few_cells():
     """One layer of cells does not determine how stresses change across it: refused on all ranks."""
     domain = mesh.create_rectangle(COMM, [[0.0, 0.0], [4.0, 1.0]], [8, 1], mesh.CellType.quadrilateral)

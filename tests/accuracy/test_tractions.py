@@ -17,6 +17,7 @@ from uem_dolfinx.accuracy.enriched import contact_tractions
 COMM = MPI.COMM_WORLD
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", slow("mortar")])
 @pytest.mark.parametrize("degree", [1, 2])
 def test_tractions_carry_the_nodal_forces(degree, coupling):

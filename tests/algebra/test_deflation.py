@@ -42,6 +42,7 @@ def iterations(problem):
     return solver.solve(P.transpose(force))[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 @pytest.mark.parametrize("amg", AMG)
 def test_iterations_do_not_depend_on_the_ratio_of_stiffness(amg, coupling):

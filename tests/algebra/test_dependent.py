@@ -246,6 +246,7 @@ def test_equal_rows_have_equal_forces(copies, scale):
     assert np.einsum("mk,mng->kng", group.shares, A) == pytest.approx(rows, abs=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.parametrize("n", [(2, 3), (3, 2), (2, 4), (2, 2)])
 def test_two_pass_is_exact_on_any_two_meshes(cell, n):

@@ -21,6 +21,7 @@ from uem_dolfinx.algebra.options import has_mumps
 COMM_SELF = MPI.COMM_SELF
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dim", [2, 3])
 def test_one_factorisation_serves_all_iterations(dim, monkeypatch):
     """The state is that of factorisations in every iteration, to the tolerance; active contactors are the same."""

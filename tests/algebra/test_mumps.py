@@ -51,6 +51,7 @@ def test_mumps_gets_the_workspace_it_asks_for(comm, kind, friction, caplog):
     assert np.abs(states[1] - states[0]).max() <= 1e-12 * np.abs(states[0]).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("workspace, gets", [(900, {"mat_mumps_icntl_14": 1900}), (1000, {})])
 def test_workspace_has_an_end(comm, workspace, gets, monkeypatch):
     """A factorisation that lacked workspace gets twice as much as it had, up to the most; then the error contains the message of MUMPS."""

@@ -224,6 +224,7 @@ def calls_of(monkeypatch, where, name):
     return made
 
 
+@pytest.mark.long
 def test_a_second_problem_on_a_mesh(comm, monkeypatch):
     """Forms alike are neither expanded nor checked again, and which cells are connected is known, in spaces of any degree."""
     b = blocks(comm, "triangle")
@@ -370,6 +371,7 @@ def test_scene_without_gmsh_matplotlib_pyvista():
     assert reported.startswith("MissingBackendError") and "matplotlib" in reported
 
 
+@pytest.mark.long
 @serial
 def test_what_is_missing_is_missing():
     """The test above does take modules away."""

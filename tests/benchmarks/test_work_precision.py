@@ -119,6 +119,7 @@ def test_every_method_solves_the_same_problem():
     assert overlaps[0] > 5 * overlaps[1] > 25 * overlaps[2] > 0.0
 
 
+@pytest.mark.long
 def test_indenter_is_exact_by_elimination():
     scene = indenter(4)
     assert measure.measure(scene, "united", runs=0)["error_energy"] < 1e-6
@@ -126,6 +127,7 @@ def test_indenter_is_exact_by_elimination():
     assert soft["error_energy"] > 10 * hard["error_energy"] > 1e-5
 
 
+@pytest.mark.long
 def test_energy_of_hertz_errors_does_not_reward_overlap():
     """The error in energy grows with the overlap, and falls with h."""
     answer = hertz_answer(1 / 60)

@@ -116,6 +116,7 @@ def test_an_expression_follows_constants_and_fields():
         T.value = 1.0
 
 
+@pytest.mark.long
 def test_in_a_mixed_space():
     """Parts of a mixed space, vectors and scalars, and components: by numbers, Constants, functions, fields and expressions alike."""
     s, V, (_, _, _, top) = square()
@@ -141,6 +142,7 @@ def test_in_a_mixed_space():
             assert uem.integrate(w[i] * uem.ds(top)) == pytest.approx(mean, rel=1e-12)
 
 
+@pytest.mark.long
 def test_a_body_of_two_fields_is_led_as_one_of_one():
     """All components of the displacement by one condition, in load steps: the displacement of the same body without a second field."""
     s, V, (left, right, _, _) = square()
@@ -237,6 +239,7 @@ def test_refused():
         refused(uem.InputError, "no derivative", lambda m=m: uem.gradient(problem, J, [m]))
 
 
+@pytest.mark.long
 def test_gradients_of_histories():
     """Derivatives of a history with such values, friction among it, against differences."""
     s, V, (left, right, bottom, top) = square(n=4)

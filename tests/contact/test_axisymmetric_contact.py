@@ -78,6 +78,7 @@ def test_tied_cylinders_are_pulled(coupling, n):
     assert contact.resultant().force == pytest.approx([0.0, p * np.pi * R**2], rel=1e-11)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", [slow("node_to_surface"), "mortar"])
 def test_true_pressures(coupling):
     """In large strains a dead load is a pressure per drawn area, and the true one that of the circle as it is now."""
@@ -133,6 +134,7 @@ def test_hertz(degree, coupling):
     assert highest(COMM, np.abs(p[inside] / (peak * np.sqrt(1 - (x[inside] / a) ** 2)) - 1)) < 0.04
 
 
+@pytest.mark.long
 def test_the_same_as_a_wedge_in_3d():
     """A rigid sphere on a cylinder of rubber, and on a slice of 6 degrees of it in 3D: forces, and displacements along the top."""
     n, height, depth, radius, angle = 8, 0.8, 0.08, 2.0, np.radians(6.0)
@@ -215,6 +217,7 @@ def punch(mu, **how):
     return s, law, contact, s.problem(law.residual(s.u, s.v) * ufl.dx, [contact])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", [slow("node_to_surface"), "mortar"])
 def test_energy_of_friction(coupling):
     """What drives a punch is stored, but for what friction takes; its tractions are within the cone at every circle."""

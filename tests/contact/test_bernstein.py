@@ -48,6 +48,7 @@ COMM = MPI.COMM_WORLD
 # -- closed forms ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("finer", ["upper", "lower"])
 @pytest.mark.parametrize("cell", CELLS)
 def test_patch(cell, finer):
@@ -74,6 +75,7 @@ def test_patch(cell, finer):
     lawful(contact, force=force)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 def test_floating_block_of_degree_two(cell, tilt):
@@ -187,6 +189,7 @@ def test_nonnegative_control_gaps_leave_no_overlap(top, seed, zeros):
     assert lowest(COMM, [top.sampled(nodal, seed)]) >= -1e-15
 
 
+@pytest.mark.long
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 1000), share=st.floats(0.05, 1.0))
 def test_control_forces_of_a_pressure_press(top, seed, share):

@@ -213,6 +213,7 @@ def test_split_beam(coupling, load):
     assert len(rates) > 1 and np.abs(np.array(rates) - 1.0).max() < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_a_fibre_is_pulled_out(coupling):
     """A fibre that shrinkage presses into a matrix: bond and friction resist, in the end friction alone, mu times the normal force."""
@@ -369,6 +370,7 @@ def test_flexure_that_snaps_back():
     assert np.abs(rates[peak + 1 :] - 1.0).max() < 0.01 and iterations.max() < 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("n", "energy"), [(5, 0.01), (8, 0.004), (10, 0.006)])
 @pytest.mark.parametrize(
     ("cell", "coupling"), [("quadrilateral", "node_to_surface"), ("triangle", "mortar"), ("quadrilateral", "mortar")]

@@ -31,6 +31,7 @@ def pressed(ratio, cell="triangle", n=(3, 4), law=with_pressure, coupling="node_
     return c.resultant().force[-1] / ((2 + ratio) / (2 * (1 + nu)) * press / 2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("ratio", "how", "least", "warned"),
     [

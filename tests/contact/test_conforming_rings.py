@@ -113,6 +113,7 @@ def test_pressures_converge():
     assert errors[1] < errors[0] / 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "layers", "past"),
     [

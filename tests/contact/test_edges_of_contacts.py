@@ -68,6 +68,7 @@ def test_in_any_pose_size_and_order(friction, how):
     assert np.abs(force - general.force).max() < 1e-6 * np.abs(general.force).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("general", [True, slow(False)])
 @pytest.mark.parametrize("friction", [0.0, slow(0.3)])
 def test_ridges_by_mortar(friction, general):

@@ -40,6 +40,7 @@ def test_a_block_slides_at_mu_times_its_load(mu, rigid, degree, coupling):
         assert scene.contact.balance().force <= 1e-12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, n",
     [

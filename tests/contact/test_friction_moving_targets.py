@@ -42,6 +42,7 @@ def test_a_turntable_under_a_block_that_is_held(coupling, centre):
     assert highest(scene.problem.comm, np.abs(force - exact)[far]) <= 4e-2 * highest(scene.problem.comm, np.abs(exact))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (1.2, -0.2)])
 @pytest.mark.parametrize(("mu", "press", "law"), [(0.1, 0.01, neo_hooke), (0.1, 0.01, linear), (0.3, 0.001, linear)])
 def test_a_slender_block_on_a_turntable(mu, press, law, centre):

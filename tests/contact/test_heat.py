@@ -268,6 +268,7 @@ def test_going_on_from_a_checkpoint(folder, h):
     refused(uem.CheckpointError, "friction_share of heat", lambda: uem.read_checkpoint(folder / "run.uem", other.problem.state()))
 
 
+@pytest.mark.long
 def test_what_is_refused():
     """Each with what to do instead."""
     b = blocks(COMM, "triangle", 2, 2)
@@ -307,6 +308,7 @@ def test_what_is_refused():
         refused(error, words, lambda h=h: run(made(h)))
 
 
+@pytest.mark.long
 def test_page_on_heat():
     """Its example has the heat that friction makes in its bodies."""
     page = (Path(__file__).parents[2] / "demos" / "site" / "howto" / "heat.md").read_text(encoding="utf-8")

@@ -101,6 +101,7 @@ def test_current_that_heats_its_joint(cell, coupling, degree):
     assert joint.contact.heat_balance() < 1e-13
 
 
+@pytest.mark.long
 def test_conductance_of_the_current_by_temperature():
     """A joint that resists more when it is warm: temperature and current solve one scalar equation."""
     h, sigma = 3.0, 0.5

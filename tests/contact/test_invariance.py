@@ -83,6 +83,7 @@ def reference():
     return answers
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_translation(reference, case):
     same(press(case[0], normals=case[1], shift=-1000.0), reference[case], 1e-9)

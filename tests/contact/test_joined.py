@@ -312,6 +312,7 @@ def test_steps_that_switch_one(monkeypatch):
     assert np.abs(one - other).max() <= 1e-10 * np.abs(other).max() and (one[:, 1] == 0.0).all(axis=1).any()
 
 
+@pytest.mark.long
 def test_a_goal_of_several(monkeypatch):
     """The error of a functional, with contactors that stick and slip, is that of contacts that are treated alone."""
     found = []

@@ -24,6 +24,7 @@ def test_slip_along_conditions_continues():
     assert continues(direction, free, away, 1e-9).tolist() == [True, True, False, False, False, False]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "n", "coupling", "size"),
     [

@@ -130,6 +130,7 @@ def alike(found, other, tolerance=1e-9):
 FLAT = [16, 5]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [

@@ -60,6 +60,7 @@ def settled(made, **how):
     return iterations, np.array([uem.integrate(part / area * uem.ds(lid)) for part in ufl.split(u)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "degree", "n", "k"),
     [

@@ -318,6 +318,7 @@ def test_adjusted_by_a_set(folder):
         )
 
 
+@pytest.mark.long
 def test_direct_steps_of_heat(folder):
     """With DIRECT all steps of time have the given length."""
     heat = "*CONDUCTIVITY\n1.\n*SPECIFIC HEAT\n1.\n*DENSITY\n1.\n*SOLID"
@@ -330,6 +331,7 @@ def test_direct_steps_of_heat(folder):
         assert not option or len(taken) == 20
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "n"), [("quad", 3), ("hexahedron", 8)])
 def test_forces_at_the_nodes_of_a_side(folder, kind, n):
     """The work of the stresses in a stretch is that of the n forces of the file, none at nodes that complete its cells."""

@@ -38,6 +38,7 @@ def ran(folder, text, **how):
     return deck
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["SURFACE TO SURFACE", "NODE TO SURFACE"])
 @pytest.mark.parametrize("nlgeom", ["", ", NLGEOM"])
 def test_two_columns(folder, how, nlgeom):
@@ -51,6 +52,7 @@ def test_two_columns(folder, how, nlgeom):
     assert deck.left_out == [] and deck.problem.progress.steps == 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", ["LINEAR", "EXPONENTIAL", "TABULAR"])
 def test_laws_of_pressure(folder, law):
     """By default contact is hard and says so; else the gap is that of the law."""

@@ -52,6 +52,7 @@ def test_a_vibration():
     assert 5 < counts[2] / counts[0] < 20
 
 
+@pytest.mark.long
 def test_steps_are_doubled_in_time():
     """Steps become longer only where twice the length is accurate as well: none is refused after the first one."""
     control = StepControl(1.0)

@@ -56,6 +56,7 @@ class Block:
         return uem.UnitedProblem(law(self.u, 2.0), self.u, bcs=bcs, couplings=[coupling], dynamics=dynamics, rtol=1e-13), dynamics
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "turns"), [("quadrilateral", "large"), slow("quadrilateral", "small"), slow("hexahedron", "large")]
 )
@@ -118,6 +119,7 @@ def test_a_free_spin(folder):
     assert np.array_equal(other.u.x.array, problem.u.x.array)
 
 
+@pytest.mark.long
 def test_a_top():
     """An asymmetric body that turns about its middle axis tumbles as Euler's equations say, to second order in the step."""
     from scipy.integrate import solve_ivp

@@ -45,6 +45,7 @@ def test_rod_on_a_wall(degree, lumped, coupling):
     assert book.impulses[-1][0] == pytest.approx(dynamics.momentum() - book.momenta[0], rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.long
 def test_free_fall_and_weight():
     """Gravity along the axis pulls at the whole body, and its kinetic energy is that of the whole body."""
     s = Revolved(rectangle((0, 0), (R, L), (1, 2)))

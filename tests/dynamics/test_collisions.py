@@ -234,6 +234,7 @@ def test_corners_that_come_back_below_the_target_are_left_out(contactors, n, nam
     assert COMM.rank != 0 or sum(int(re.search(r": (\d+) contactors", record.getMessage())[1]) for record in reported) == named
 
 
+@pytest.mark.long
 def test_both_sides_are_massless_where_bodies_can_carry_it(caplog):
     """A rod of one layer of elements keeps the mass of its surface; a stiffer contactor on it is warned of, a softer one is not."""
 

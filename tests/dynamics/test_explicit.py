@@ -28,6 +28,7 @@ from uem_dolfinx.solve.united import system
 COMM = MPI.COMM_WORLD
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("dim", "law", "speed", "within"), [(2, uem.LinearElastic, 10.0, 5e-3), (3, uem.LinearElastic, 10.0, 5e-3),
                                                              (2, uem.NeoHooke, 1.0, 2e-2)])  # fmt: skip
 def test_a_bar_on_a_wall(dim, law, speed, within):
@@ -153,6 +154,7 @@ def test_runs_without_a_step():
         next(iter(uem.time_steps(bar.problem, None, 1.0)))
 
 
+@pytest.mark.long
 def test_steps_that_shrink():
     """A bar that is squeezed has shorter cells, and shorter steps each time that its cells are shorter by a tenth."""
     bar = Flight(2, 90, law=uem.NeoHooke)
@@ -227,6 +229,7 @@ def test_calls_of_a_step(monkeypatch):
     assert len(calls) <= 5 * 3000 or COMM.size > 1
 
 
+@pytest.mark.long
 def test_how_long_a_factor_of_the_surface_serves(monkeypatch):
     """Four solves bring the surface of a bar of NeoHooke's law into equilibrium, or leave the rest to one iteration of Newton's method."""
     solves, factors, inside = [0], [0], []

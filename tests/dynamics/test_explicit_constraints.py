@@ -184,6 +184,7 @@ def test_a_rigid_head(law, rotations):
     assert found[0] == pytest.approx(found[1], rel=0.06)
 
 
+@pytest.mark.long
 def test_a_motor():
     """A led rotation is exact at the end of every step, and drives the elastic part."""
     p = Plate(

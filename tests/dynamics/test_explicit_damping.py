@@ -112,6 +112,7 @@ def test_damping_shortens_the_step():
     assert abs(damped * (c + np.sqrt(c**2 + 4 * w**2)) / 4 - 1) < 0.02
 
 
+@pytest.mark.long
 def test_bulk_viscosity_calms_a_wave():
     """Velocities overshoot behind the front of a bar that hits a wall, and much less with viscosity."""
     overshoot = []

@@ -110,6 +110,7 @@ def test_cells_that_collapse():
             raised(uem.InvertedElementError, "cells collapse", stepper.look)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "contactors"),
     [
@@ -151,6 +152,7 @@ def test_the_memory_of_a_run():
     assert reduced(COMM, float(most[1] - most[0]), op=MPI.MAX) < 20e3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("contactors", ["massy", slow("massless")])
 def test_rubber_at_the_speed_of_its_waves(contactors):
     """Crushed cells are strained by at most a tenth in a step, and energy neither grows nor falls."""
@@ -238,6 +240,7 @@ def test_yielded_bars_have_the_critical_step_of_unloading():
     assert abs(ExplicitStepper(bar.problem).critical_step() / elastic - 1) < 1e-2
 
 
+@pytest.mark.long
 def test_a_step_returns_stresses_once(monkeypatch):
     """A step and its row in an energy book map stresses back once, while the bar yields at the wall; supports are held."""
     bar, updates, update = Bar(uem.FinitePlasticity, 20, 1.0, contactors="massy"), [], uem.FinitePlasticity.update

@@ -111,6 +111,7 @@ def test_what_is_lost_is_of_the_mesh():
     assert 0.8 < np.log2(lost[0] / lost[1]) < 1.2 and 0.8 < np.log2(lost[1] / lost[2]) < 1.2, lost
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how", [{"cells": 20}, {"cells": 20, "general": True}, {"cells": 20, "coupling": "mortar"}, {"dim": 3, "cells": 10}], ids=str
 )
@@ -274,6 +275,7 @@ def test_a_step_in_lasting_contact(monkeypatch, how, factors, calls):
     assert len(called) <= 5 * calls or COMM.size > 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lower", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_velocities_at_rest(lower):
     """Bodies that lie on a floor, or on each other, do not fall at the end of a step, by gravity times half a step or otherwise."""

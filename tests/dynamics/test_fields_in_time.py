@@ -59,6 +59,7 @@ class Fall:
         return np.array(rows)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pressure", [0, 1])
 def test_a_pressure_that_changes_nothing(pressure):
     """Forces of an impact with friction, works and momenta are those of the same block without it, in as many iterations."""

@@ -116,6 +116,7 @@ def stopping(a, b, v):
     return v / b - a / b * t, t
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("coupling", "cell", "steps"),
     [("node_to_surface", "quadrilateral", (8, 32)), ("mortar", "quadrilateral", (8,)), ("node_to_surface", "hexahedron", (8,))],
@@ -136,6 +137,7 @@ def test_a_block_stops(coupling, cell, steps):
     assert errors[-1] <= 0.3 ** (len(errors) - 1) * errors[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("coupling", "cell"), [(c, "quadrilateral") for c in COUPLINGS] + [("node_to_surface", "hexahedron")])
 def test_a_block_on_a_film(coupling, cell):
     """On a viscous film the speed of a block of mass 1 on area 1 falls as exp(-eta t), and the film dissipates its energy."""

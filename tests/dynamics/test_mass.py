@@ -119,6 +119,7 @@ def test_graded_triangles_keep_their_centre(degree):
     assert lumped.centre == pytest.approx([0.5, 0.5], rel=1e-13) and lumped.total == pytest.approx([2.0, 2.0], rel=1e-13)
 
 
+@pytest.mark.long
 def test_density_of_any_kind():
     """Number, Constant, Function and expression weigh the same."""
     V = block("triangle", 3)

@@ -30,6 +30,7 @@ def first_mode(X):
 # ---------------------------------------------------------------------------------------------- rules
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "scheme",
     [
@@ -111,6 +112,7 @@ def test_first_acceleration():
     assert np.allclose(a[free], -10.0, rtol=1e-2) and np.all(a[~free] == 0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [0.5, 20.0])
 def test_damping_form(rate):
     """Damping in proportion to the mass slows a free bar down like exp(-rate t)."""

@@ -104,6 +104,7 @@ class TestWholeCircles:
                 assert mass.centre == pytest.approx([0.0, H / 2], abs=1e-13)
 
 
+@pytest.mark.long
 def test_a_form_of_ones_own():
     """UFL without a law of the package is integrated over circles as well: the same residual, and the same answer."""
     answers = []
@@ -136,6 +137,7 @@ def test_hoop_strains_get_a_sensible_rule():
             assert integral.metadata()["quadrature_degree"] == 4
 
 
+@pytest.mark.long
 def test_the_shape_of_bodies_of_revolution():
     """The derivative of the volume by the places of nodes is that of circles; by a pressure, of a body with its own residual."""
     s = cylinder("triangle")

@@ -58,6 +58,7 @@ def measure(mesh, dx):
     return uem.integrate(fem.Constant(mesh, 1.0) * dx)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("cell", "degree"), KINDS)
 def test_a_block_in_two(cell, degree):
     """Both faces have the section's area and are exterior; volume, ends and sides stay; one half moves without the other."""

@@ -68,6 +68,7 @@ def test_refused_before_the_first_step(what):
     assert s.problem.progress.steps == 0 and s.problem.history is None
 
 
+@pytest.mark.long
 def test_announced_and_taken():
     """Controls that have derivatives change nothing."""
     s = assembly(feature=tie)

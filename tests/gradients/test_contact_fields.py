@@ -52,6 +52,7 @@ def test_by_friction(cell, law):
     assert uem.taylor_test(lambda h: drag_anew(s, "X", shift, h)[1], dot(by_shape, shift), 4e-4, 1) >= 1.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rigid", [None, slow("plane"), slow(True)])
 @pytest.mark.parametrize("cell", ["triangle", slow("tetrahedron"), slow("hexahedron")])
 def test_by_offset(cell, rigid):
@@ -81,6 +82,7 @@ def test_by_offset(cell, rigid):
     assert uem.taylor_test(moved, dot(by_shape, shift), 1e-3, 2) >= 1.95
 
 
+@pytest.mark.long
 def test_sums_are_the_derivatives_by_a_uniform_change():
     """All entries together make the derivative by a uniform increment, of the friction in a history and of the offset in a state."""
     s = dragged("triangle", mu=rough)

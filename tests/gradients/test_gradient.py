@@ -31,6 +31,7 @@ def test_of_second_order(cell, degree, coupling, rigid, law):
     assert min(orders(s, lambda problem: s.J).values()) >= 1.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell, degree, coupling, rigid, law", SCENES)
 def test_forward_and_adjoint_agree(cell, degree, coupling, rigid, law):
     """The derivative of J along any direction is that of u, put into J."""
@@ -46,6 +47,7 @@ def test_forward_and_adjoint_agree(cell, degree, coupling, rigid, law):
     assert uem.integrate(ufl.algorithms.expand_derivatives(explicit)) == pytest.approx(adjoint, rel=1e-11)
 
 
+@pytest.mark.long
 def test_a_tangent_that_is_not_symmetric():
     """Under a pressure that follows the surface the adjoint problem has the transposed matrix."""
     b = blocks(COMM, "triangle", 2, 3, overhang=0.25)
@@ -159,6 +161,7 @@ def test_contactors_that_are_held():
     assert uem.integrate(ufl.derivative(J, b.u, du)) == pytest.approx(by[1], rel=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not has_hypre(), reason="needs hypre")
 def test_iterative_solvers():
     """CG finds the gradient that a factorisation does."""
@@ -250,6 +253,7 @@ def test_where_earlier_steps_ended():
                 refused(uem.InputError, "where an earlier step ended", by)
 
 
+@pytest.mark.long
 def test_shape_with_mortar_on_hexahedra_is_refused():
     """Facets of hexahedra warp with their nodes; other controls, and nodes in place of mortar, keep their gradients."""
     s = pressed("hexahedron", law="linear", coupling="mortar")

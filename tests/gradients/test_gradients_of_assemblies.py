@@ -123,6 +123,7 @@ def test_steps():
 BOTH_WAYS = ("tie across a gap", "preload", "shortening", "coupling, spring", "coupling, led", "equation")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", BOTH_WAYS)
 def test_forward_as_backward(what):
     """The adjoint's derivative is the one of the displacement, put into J."""

@@ -116,6 +116,7 @@ EXACT = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", EXACT)
 def test_exact(what):
     assert order(pressed(**EXACT[what])) >= 1.9

@@ -194,6 +194,7 @@ def test_general_contact():
     refused(uem.errors.InputError, "sharp edges of the contactor press", lambda: uem.gradient(problem, s.J, s.E))
 
 
+@pytest.mark.long
 def test_what_is_refused():
     """Damping in time, areas that change, the shape, offsets and pressures are refused by name, before any work."""
     soft = LAWS["exponential"]

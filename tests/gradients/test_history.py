@@ -23,6 +23,7 @@ COMM = MPI.COMM_WORLD
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell, rigid, law, names, how", [DRAGGED[0], *(slow(*scene) for scene in DRAGGED[1:])])
 def test_of_second_order(cell, rigid, law, names, how):
     """``J(h) - J(0) - h J'`` vanishes with h^2 over all steps, for every kind of control, where the same contactors stick and slip."""

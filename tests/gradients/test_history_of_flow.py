@@ -44,6 +44,7 @@ def changes(s):
     return [(control, control, change) for control, change in changes_of_flow(s)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", SCENES)
 def test_of_second_order(how):
     """``J(h) - J(0) - h J'`` vanishes with h^2 where the same points flow, and two ranks tell the same slope."""

@@ -43,6 +43,7 @@ def test_pressures_past_the_ends_of_the_target(coupling):
     assert min(orders(s, s.of_pressures, "E", "X").values()) >= 1.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, degree, coupling, rigid, law, measure", QUICK + [slow(*case) for case in CASES if case not in QUICK]
 )
@@ -86,6 +87,7 @@ def test_any_ranks(coupling):
     assert found[0] == pytest.approx(found[1], rel=1e-10)
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("rigid", [False, True])
 def test_pressures_are_as_the_modulus(coupling, rigid):
@@ -101,6 +103,7 @@ def test_pressures_are_as_the_modulus(coupling, rigid):
     assert np.abs(dp.x.array - p.x.array / float(s.E.value)).max() <= 1e-8 * np.abs(p.x.array).max(initial=1.0)
 
 
+@pytest.mark.long
 @BOTH
 def test_resultants(coupling):
     """The force that a contact exerts on the contactor is the residual with a unit vector at the contactors, and has a gradient."""

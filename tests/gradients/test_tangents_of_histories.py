@@ -38,6 +38,7 @@ def pairs_of(s, contact, names):
     return [(control_of(s, contact, name), changed(s, name)) for name in names]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell, rigid, law, names, how", [DRAGGED[0], *(slow(*scene) for scene in DRAGGED[1:])])
 def test_forward_as_backward(cell, rigid, law, names, how):
     """Over steps in which some contactors stick and others slip, along all controls at once, on any ranks."""

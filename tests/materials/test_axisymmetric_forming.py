@@ -40,6 +40,7 @@ def metal(s: Revolved, *parameters: float, **how: float) -> uem.FinitePlasticity
 # -- closed forms ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell, degree", [("quadrilateral", 1), slow("quadrilateral", 2)])
 def test_a_billet_is_upset_without_friction(cell, degree):
     """By a rigid plane to half its height: Kirchhoff's stress times the area that an incompressible billet would have; and back."""
@@ -61,6 +62,7 @@ def test_a_billet_is_upset_without_friction(cell, degree):
     assert law.dissipation() == pytest.approx(np.pi * (FY - H * plastic / 2) * -plastic, rel=1e-7)
 
 
+@pytest.mark.long
 def test_a_stretch_is_that_of_a_cube():
     """A homogeneous stretch along all three axes, there and back, with the stress of the law in 3D."""
     s = Revolved(rectangle((0.5, 0), (1, 1), (2, 2)))

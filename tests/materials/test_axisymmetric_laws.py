@@ -125,6 +125,7 @@ def test_stresses_on_the_axis():
     assert highest(COMM, np.abs(values[:, 0] - values[:, 8])) < 1e-14
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", [slow(uem.LinearElastic), slow(uem.StVenantKirchhoff), uem.NeoHooke])
 def test_hoop_stretch(law):
     """A homogeneous stretch: stresses are those of the law in 3D, with F_33 = 1 + u_r / r."""
@@ -142,6 +143,7 @@ def test_hoop_stretch(law):
     assert uem.integrate(own.energy(s.u) * ufl.dx) == pytest.approx(uem.integrate(other.energy(u) * ufl.dx) * volume, rel=1e-9)
 
 
+@pytest.mark.long
 def test_bodies_that_hardly_change_their_volume():
     """Selective reduced integration: the expansion of a nearly incompressible tube, of which linear cells leave a fraction."""
     p, nu, found = 10.0, 0.49999, []
@@ -158,6 +160,7 @@ def test_bodies_that_hardly_change_their_volume():
     refused(uem.InputError, ["degree 1", "degree 2"], lambda: law.residual_form(s.u, s.v))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("cell", "degree", "bound"), [
     ("quadrilateral", 1, 2e-3), slow("quadrilateral", 2, 2e-5), slow("triangle", 2, 2e-5),
 ])  # fmt: skip
@@ -215,6 +218,7 @@ def test_patch_of_plasticity(degree, bound):
     assert highest(COMM, np.abs(stress - np.diag([0.0, -3.0, 0.0]))) < 3.0 * bound
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strain", [slow("small"), "green_lagrange"])
 def test_tangent_of_plasticity(strain):
     """Newton's method is quadratic while a cylinder is upset between rough plates."""
@@ -231,6 +235,7 @@ def test_tangent_of_plasticity(strain):
     assert highest(COMM, law.peeq.x.array) > 0.01
 
 
+@pytest.mark.long
 def test_pressure_that_follows_the_surface():
     """On all of a cylinder it shrinks it alike in all directions, until its energy falls by as much as p does work on the volume."""
     s, law, p = Revolved(rectangle((0, 0), (1, 1), (2, 2))), uem.NeoHooke(1.0, 0.3, kind="axisymmetric"), 0.5

@@ -180,6 +180,7 @@ def test_degrees_that_are_set(law, degree):
 # ------------------------------------------------------------------------------ bodies that hardly change their volume
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(
     "cell,degree",
@@ -224,6 +225,7 @@ def noise(u, seed):
     return np.array(f.x.array)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell,degree,least", [("quadrilateral", 1, 5.0), pytest.param("hexahedron", 1, 3.0, marks=pytest.mark.slow)]
 )

@@ -37,6 +37,7 @@ def tensors(material: uem.FinitePlasticity, name: str) -> np.ndarray:
 # -- closed forms ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_uniaxial_tension(comm, law):
     """The logarithmic strain and the Kirchhoff stress obey the equations of small strains: to three times the length, and back."""
@@ -152,6 +153,7 @@ def test_small_strains_are_those_of_the_small_law(comm, cell, kind):
 # -- forms -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, degree, kind, law",
     [

@@ -42,6 +42,7 @@ def test_a_tube_widens_without_locking(cell, n, degree, error):
     assert max(step.newton_iterations for step in steps) <= 8
 
 
+@pytest.mark.long
 def test_linear_simplices_lock():
     assert widened("triangle", 2, 1)[0] > 1.1
 

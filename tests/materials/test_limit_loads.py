@@ -26,6 +26,7 @@ def limit_load(comm: MPI.Comm, cell: str, n: int, degree: int) -> tuple[float, l
     return pressure / (2 / 3**0.5 * np.log(2)), steps
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, n, degree, error",
     [
@@ -41,6 +42,7 @@ def test_limit_load_of_a_tube(comm, cell, n, degree, error):
     assert max(step.newton_iterations for step in steps) <= 6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_linear_simplices_lock_as_documented(comm, cell):
     assert limit_load(comm, cell, 4, 1)[0] > 1.1
@@ -90,6 +92,7 @@ def beams(comm: MPI.Comm) -> tuple[np.ndarray, list[float]]:
     return s.gather(u), figures
 
 
+@pytest.mark.long
 def test_any_number_of_ranks_gives_the_same(comm):
     """Some ranks have no plastic cell."""
     u, figures = beams(comm)

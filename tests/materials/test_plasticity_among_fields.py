@@ -27,6 +27,7 @@ def conduction(T: Any, q: Any) -> ufl.Form:
     return 1e7 * ufl.inner(ufl.grad(T), ufl.grad(q)) * ufl.dx
 
 
+@pytest.mark.long
 def test_heated_and_cooled_between_walls(comm):
     """In plane strain, free in the third direction: the deviator's strain is twice the thermal one, less what the pressure takes."""
     s, _ = block(comm, "quadrilateral")
@@ -86,6 +87,7 @@ class Pressed:
             assert highest(COMM, np.abs(here - there)) <= bound * highest(COMM, np.abs(here))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "law, displacement", [(uem.VonMises, 0), slow(uem.VonMises, 1), slow(uem.FinitePlasticity, 0), slow(uem.FinitePlasticity, 1)]
 )

@@ -112,6 +112,7 @@ def test_plane_strain_tension_tends_to_its_limit(comm):
 # -- forms -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strain, law", [("small", uem.LinearElastic), ("green_lagrange", uem.StVenantKirchhoff)])
 @pytest.mark.parametrize(
     "cell, degree, kind",
@@ -157,6 +158,7 @@ def test_without_yield_it_is_the_elastic_law(comm, cell, degree, kind, strain, l
     assert K.norm() < rounding * scale
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strain", plasticity.STRAINS)
 @pytest.mark.parametrize(
     "cell, degree, kind",

@@ -40,6 +40,7 @@ def written(folder, cell, degree=1):
     return b, problem, kept
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("own", [False, True])
 @pytest.mark.parametrize("cell", helpers.CELLS)
 def test_fields_come_back(folder, cell, own):
@@ -135,6 +136,7 @@ def test_other_numbers_of_ranks(folder):
         assert force == uem.read_results(folder / "run").history["force_y"][-1]
 
 
+@pytest.mark.long
 def test_shapes(folder):
     """Hoop strains are kept, as the third component of tensors, and shapes are as given."""
     s = scene(COMM, "triangle", [box("triangle", [0.0, 0.0], [1.0, 1.0], [2, 2])])

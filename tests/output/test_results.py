@@ -132,6 +132,7 @@ def test_columns_are_the_same_on_all_ranks(folder: Path) -> None:
         uem.HistoryWriter(folder / "history.csv", pressed("triangle"), columns={"own": lambda: float(comm.rank)})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_files_for_paraview(folder: Path, cell: str, degree: int) -> None:

@@ -47,6 +47,7 @@ def contents(folder):
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell, degree", [("triangle", 2), ("quadrilateral", 1), ("tetrahedron", 1), ("hexahedron", 1)])
 def test_same_on_every_number_of_ranks(cell, degree, folder):
     """One rank alone and all together write the same text, mesh and values; the mesh is the one that was read."""

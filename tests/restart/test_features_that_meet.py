@@ -274,6 +274,7 @@ def test_gone_on_with(make, tmp_path):
     same(last, whole)
 
 
+@pytest.mark.long
 def test_other_fields_and_a_tie(tmp_path):
     """What a file has of displacement and temperature is there where ties are read, too."""
 
@@ -299,6 +300,7 @@ def test_other_fields_and_a_tie(tmp_path):
     assert min(sizes(w)) > 1e-5 and sizes(read) == pytest.approx(sizes(w), rel=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("iterations", [1, 50])
 @pytest.mark.parametrize(
     "make", [m for m in MEETINGS if "time" not in m.__name__ and "explicit" not in m.__name__], ids=lambda f: f.__name__

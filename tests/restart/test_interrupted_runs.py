@@ -143,6 +143,7 @@ def test_ranks_change(writer, reader, folder):
     assert np.abs(x - y).max() <= 1e-9 * np.abs(x).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "other, match",
     [

@@ -78,6 +78,7 @@ class Arch:
         )
 
 
+@pytest.mark.long
 def test_a_step_that_fails_after_an_unstable_equilibrium_says_so():
     """The united matrix has a negative eigenvalue between the limit points, where the load falls, and at no stable equilibrium."""
     arch, h, reported = Arch(n=20), 1e-3, []

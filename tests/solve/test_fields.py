@@ -67,6 +67,7 @@ def test_rows_of_the_displacement_and_of_other_fields(cell, displacement):
     assert (columns.reshape(-1, g) // g == columns[::g, None] // g).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("coupling", "more", "degree"),
     [
@@ -137,6 +138,7 @@ def test_blocks_that_keep_their_volume(cell, n_high, coupling, nu):
     assert not problem.solver.indefinite and problem.solver.pc.getType() == "cholesky"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("coupling", ["node_to_surface", "mortar"])
 def test_pressure_as_a_field_of_its_own(coupling):
     """At nu = 0.49 a clamped block presses as it does in displacements alone, but for the error of the mesh."""
@@ -182,6 +184,7 @@ def test_heat_closes_a_gap(coupling, unit):
     assert not pressed[0] and pressed[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", [1.0, 1e-3, 1e6])
 def test_a_field_that_changes_in_equilibrium(unit):
     """Free expansion at large displacements in steps of time: forces vanish in every step, and Newton's steps are full."""
@@ -221,6 +224,7 @@ def test_every_field_is_solved_beside_the_largest_forces():
     assert rows.norms(R)[1] < 1e-8 * every[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "E", "contact"),
     [(neo_hooke_with_pressure, 2e11, True), (with_pressure, 1.0, True), (neo_hooke_with_pressure, 1.0, False)],
@@ -245,6 +249,7 @@ def test_unloaded_to_nothing(law, E, contact):
     assert left[0] <= 1e-14 and left[1] <= 1e-14 * E
 
 
+@pytest.mark.long
 def test_other_fields_do_not_hide_that_there_is_no_stiffness():
     """A body of negative modulus makes negative eigenvalues beyond those of its pressures."""
     b = blocks(COMM, "triangle", 2, 2, gap=0.5)
@@ -352,6 +357,7 @@ def test_going_on_from_a_checkpoint(folder):
     assert abs(again.dissipation - contact.dissipation) <= bits < contact.dissipation
 
 
+@pytest.mark.long
 def test_a_step_taken_again():
     """It comes to the same state, from that which the step began with."""
     problem, contact = heated()

@@ -181,6 +181,7 @@ def test_two_fall_on_a_third():
         assert contact.n_active >= 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_middle_block_between_two(cell):
     """Held by nothing but its neighbours, it carries their force: three springs in series."""
@@ -250,6 +251,7 @@ def test_units(reference, law):
         assert scaled["iterations"] == reference[law]["iterations"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_pose_and_numbering(reference, law):
     """The whole scene turned with its load, and its nodes shuffled."""

@@ -50,6 +50,7 @@ def test_a_bar():
     assert np.abs(gram - np.eye(3)).max() <= 1e-8
 
 
+@pytest.mark.long
 def test_a_bar_with_a_pressure_of_its_own():
     """Constant in cells it changes no frequency, touching a wall; a temperature that strains the bar is refused."""
     s, V, _, _ = column(4)

@@ -77,6 +77,7 @@ def test_rows_that_contradict_each_other():
     assert nearest_point(np.zeros(2), G[:1], np.array([0.1]))[0] == pytest.approx([0.1, 0.0], abs=1e-12)
 
 
+@pytest.mark.long
 def test_bodies_apart_are_programmes_of_their_own(monkeypatch):
     """Bodies that push each other in pairs move as each pair would alone, and no programme has more unknowns than two bodies."""
     rng = np.random.default_rng(3)

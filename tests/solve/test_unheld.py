@@ -187,6 +187,7 @@ class Pressed:
         return uem.Contact(self.b.high, self.b.low, **how)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize(("coupling", "options"), [("node_to_surface", None), ("mortar", None), ("node_to_surface", CG)])
 def test_a_held_body_that_is_left_out_of_the_residual(cell, coupling, options):
