@@ -75,6 +75,7 @@ def test_declared_contacts(caplog, coupling):
         caplog.clear()
         reported = warned(caplog, contact=contact)
         assert len(reported) == 1 and reported[0].startswith("roofs: sharp edges")
+        assert "edges = True, with hard contact and sliding = 'finite'; else" in reported[0]
 
 
 @pytest.mark.slow

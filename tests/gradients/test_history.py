@@ -102,6 +102,9 @@ def test_what_is_refused():
         ({"normals": "averaged"}, "normals='facet'"),
     ):
         refused(uem.InputError, f"has derivatives for {words}", lambda how=how: record(problem(**how)))
+    fit = problem(coupling="mortar", offset=1e-3)
+    by_offset = {"controls": uem.ContactParameter(fit.contacts[0], "offset")}
+    refused(uem.InputError, "with friction and coupling='mortar'", lambda: uem.recording(fit, **by_offset).__enter__())
     begun = problem()
     run(begun)
     refused(uem.InputError, "expected a problem that is recorded from its first step on", lambda: record(begun))

@@ -189,10 +189,11 @@ DRAGGED += [
     ("triangle", None, "neo", ("friction", "E", "top"), {"coupling": "mortar", "ring": True}),
     ("triangle", "sphere", "neo", ("friction", "X", "place"), {"coupling": "mortar", "degree": 2}),
     ("triangle", None, "neo", ("friction", "X", "E", "top", "full"), {"coupling": "mortar", "degree": 2}),
+    ("triangle", None, "neo", ("friction", "X", "E", "top"), {"coupling": "mortar", "offset": 0.01}),
 ]
 
 
-def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="node_to_surface", degree=1, ring=False):
+def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="node_to_surface", degree=1, ring=False, offset=0.0):
     """A block that is pressed onto another, or onto a rigid surface, and dragged over it in some steps: some contactors stick, others slip.
 
     ``mu``: the coefficient of friction, or a function of a scalar space that returns a Function. ``ring``: of revolution, about an axis.
@@ -212,7 +213,7 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="n
     push = fem.dirichletbc(top, fem.locate_dofs_topological(b.V, g - 1, b.top.entities), b.V)
     if callable(mu):
         mu = mu(compat.function_space(mesh, ("Lagrange", 1)))
-    values = {"full": np.full(g, 0.002), "friction": mu, "place": np.zeros(g), "turn": np.zeros(() if g == 2 else 3)}
+    values = {"full": np.full(g, 0.002), "friction": mu, "offset": offset, "place": np.zeros(g), "turn": np.zeros(() if g == 2 else 3)}
 
     def solve():
         u.x.array[:] = 0.0
@@ -221,7 +222,7 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="n
             middle, up = [0.5] * (g - 1), np.eye(g)[-1] + 0.05 * np.eye(g)[0]
             target = uem.RigidPlane([*middle, 0.0], up) if rigid == "plane" else uem.RigidSphere([*middle, -3.0], 3.0)
             target.move(values["place"], values["turn"])
-        contact = uem.Contact(b.high, target, friction=values["friction"], coupling=coupling)
+        contact = uem.Contact(b.high, target, friction=values["friction"], coupling=coupling, offset=float(values["offset"]))
         bcs, load = [*clamp(b.V, b.bottom), push], {full: values["full"]}
         problem, states = uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load=load, rtol=1e-13), []
         with uem.recording(problem) as history:

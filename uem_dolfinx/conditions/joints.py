@@ -333,7 +333,7 @@ class Spring(Link):
         uem.Spring(None, mass, 50.0, points=((0.0, 0.0), (0.0, -1.0)), free_length=0.8)
 
     Pass it to ``UnitedProblem(..., couplings=[frame, wheel, spring])``. A torsional spring is ``stiffness`` of a ``Hinge``, a spring of
-    a node to the ground a ``PointSpring``.
+    a node to the ground a ``PointSpring``. Ends on bodies that deform have rigid couplings of the facets around them.
 
     Args:
         a, b: rigid couplings of the problem; None is the ground.

@@ -337,6 +337,11 @@ def refuse_parameter(m: ContactParameter, what: str) -> None:
         raise InputError(
             f"{what} is the offset of contact '{m.contact.name}', which is soft: expected a Constant of its law, or place or turn"
         )
+    if m.parameter == "offset" and m.contact.pair.friction is not None and m.contact.coupling == "mortar":
+        raise InputError(
+            f"{what} is the offset of contact '{m.contact.name}', with friction and coupling='mortar', whose tangential forces have no "
+            "derivative by it: expected another control, or differences of runs"
+        )
     if m.contact.tied and m.parameter not in ("force", "shortening"):
         raise InputError(
             f"{what} is the {m.parameter} of contact '{m.contact.name}', which is tied: expected a contact that is not, or the force or "

@@ -66,6 +66,6 @@ def warn(name: str, found: Crossing) -> None:
     place = ", ".join(f"{x:.6g}" for x in found.place)
     logger.warning(
         "%s: sharp edges of two surfaces cross between their nodes, %.4g deep inside each other at (%s), and no equation holds them apart: "
-        "take edges = True, with hard contact by node_to_surface; else refine both edges there, or round them off",
+        "take edges = True, with hard contact and sliding = 'finite'; else refine both edges there, or round them off",
         name, found.depth, place,
     )  # fmt: skip
