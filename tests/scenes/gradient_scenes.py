@@ -193,7 +193,9 @@ DRAGGED += [
 ]
 
 
-def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="node_to_surface", degree=1, ring=False, offset=0.0):
+def dragged(
+    cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="node_to_surface", degree=1, ring=False, offset=0.0
+):
     """A block that is pressed onto another, or onto a rigid surface, and dragged over it in some steps: some contactors stick, others slip.
 
     ``mu``: the coefficient of friction, or a function of a scalar space that returns a Function. ``ring``: of revolution, about an axis.
@@ -213,7 +215,13 @@ def dragged(cell, rigid=None, law="neo", steps=2, mu=0.3, comm=COMM, coupling="n
     push = fem.dirichletbc(top, fem.locate_dofs_topological(b.V, g - 1, b.top.entities), b.V)
     if callable(mu):
         mu = mu(compat.function_space(mesh, ("Lagrange", 1)))
-    values = {"full": np.full(g, 0.002), "friction": mu, "offset": offset, "place": np.zeros(g), "turn": np.zeros(() if g == 2 else 3)}
+    values = {
+        "full": np.full(g, 0.002),
+        "friction": mu,
+        "offset": offset,
+        "place": np.zeros(g),
+        "turn": np.zeros(() if g == 2 else 3),
+    }
 
     def solve():
         u.x.array[:] = 0.0
