@@ -66,6 +66,16 @@ def test_conductance_in_contact_by_temperature(coupling):
         assert all(last <= 0.5 * before**2 for before, last in zip(residuals[:-2], residuals[1:-1]))
 
 
+@pytest.mark.parametrize(("coupling", "degree"), [("mortar", 2), slow("mortar", 1), slow("node_to_surface", 2)])
+def test_conductance_of_a_film(coupling, degree):
+    """A film between even surfaces conducts by its thickness, the gap, which is the same at all contactors."""
+    n = 3 if coupling == "node_to_surface" else 4
+    bars = Bars(lambda p, g: 10.0 / np.maximum(g, 1e-3), degree=degree, n=n, coupling=coupling, gap=0.1, press=0.0)
+    bars.problem.solve()
+    assert highest(COMM, np.abs(bars.contact.gap.x.array[bars.contact.nodes] / 0.1 - 1.0)) < 1e-12
+    assert highest(COMM, np.abs(bars.flux / flux_through(lambda T, t: 100.0 * (T - t)) - 1.0)) < 1e-10
+
+
 def test_radiation_to_a_rigid_surface():
     """A bar, hot at its top, faces a surface of a given temperature."""
     joint = Bars(radiation, gap=0.5, press=0.0, rigid=uem.RigidPlane((0.0, 0.4), (0.0, 1.0)))

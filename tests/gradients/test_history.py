@@ -98,7 +98,8 @@ def test_what_is_refused():
         ({"friction": uem.Tresca(1.0)}, "Coulomb's law"),
         ({"friction": uem.Coulomb(0.3, 1.0)}, "Coulomb's law, without limit"),
         ({"wear": 1e-3}, "no wear"),
-        ({"offset": 1e-3}, "no offset"),
+        ({"offset": 1e-3}, "no offset with nodes"),
+        ({"adjust": 1e-3, "coupling": "mortar"}, "no offset with nodes, and no adjust"),
         ({"normals": "averaged"}, "normals='facet'"),
     ):
         refused(uem.InputError, f"has derivatives for {words}", lambda how=how: record(problem(**how)))

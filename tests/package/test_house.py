@@ -119,7 +119,7 @@ def test_imports_point_one_way():
 #: What may not grow: a commit that needs more raises the number, and gives the reason and what it removed.
 BUDGETS = {
     "members of the seam": 26, "members of Interface": 49, "heuristics": 12, "arrows within contact": 70, "arrows within solve": 35,
-    "lines of the package": 60154,
+    "lines of the package": 60158,
 }  # fmt: skip
 
 

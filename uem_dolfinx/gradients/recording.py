@@ -47,7 +47,7 @@ def recording(
 
     Raises:
         InputError, InputTypeError: for a problem without such derivatives: with other laws with history or of friction, wear, ties,
-            offsets of contacts with friction and nodes, or in time sliding='small'; or if the folder does not exist.
+            adjust and with nodes offsets of contacts with friction, or in time sliding='small'; or if the folder does not exist.
     """
     check_problem(problem)
     with agreed(problem.comm):
@@ -117,7 +117,10 @@ def _check_friction(problem: UnitedProblem, contact: Any) -> None:
         (contact.normals != "facet", "normals='facet'"),
         (type(law) is not Coulomb or law.per_area or law.per_point or follows_load(law), "Coulomb's law, without limit or load"),
         (pair.friction.wear is not None, "no wear"),
-        (not mortar and pair.discretisation.setting.offset is not None, "no offset and no adjust, or coupling='mortar',"),
+        (
+            contact.adjust or (not mortar and pair.discretisation.setting.offset is not None),
+            "no offset with nodes, and no adjust,",
+        ),
         (not keeps_distance(contact), "a rigid plane, sphere or cylinder"),
     ):
         if wrong:

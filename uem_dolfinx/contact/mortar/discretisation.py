@@ -98,7 +98,8 @@ class Mortar(Contactors):
             nearest = self.on_target(points, self.anchor)
             rows = self._follow(*self._kept)
         gap = rows.length * rows.equations.gap
-        seen: Any = replace(nearest, gap=gap, normal=rows.plain.direction)  # type: ignore[type-var]
+        # at degree 2 rows have other scales than means
+        seen: Any = replace(nearest, gap=gap / rows.share, normal=rows.plain.direction)  # type: ignore[type-var]
         if self.target.n_nodes:
             # forces and their reactions lie on one line through the contactor
             seen = seen.with_rows(np.flatnonzero(rows.covered), {"foot": points[rows.covered]})
