@@ -10,7 +10,6 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import ufl
-from body_scenes import fork
 from dolfinx import fem
 from helpers import NU, M, arch, at, blocks, box, clamp, highest, linear, refused, run, scene, slow, st_venant
 
@@ -157,33 +156,6 @@ def test_a_load_cycle_is_elastic(law):
     problem = pressed(b, lambda s: 0.02 * (1.0 - 0.9 * abs(2.0 * s - 1.0)), [contact], st_venant)
     states = [(settled(b), contact.max_pressure()) for _ in uem.load_steps(problem, 8)]
     assert states[4:-1] == [pytest.approx(state, rel=1e-8) for state in states[2::-1]]
-
-
-@pytest.mark.long
-def test_prongs_of_one_body():
-    """A fork that is pressed together touches itself by a pressure, which tends to hard contact, and forces balance."""
-
-    def closed(normal):
-        s = scene(COMM, "quadrilateral", [fork("quadrilateral")])
-        V = compat.function_space(s.mesh, 1, (2,))
-        u, v = fem.Function(V), ufl.TestFunction(V)
-        push = fem.Constant(s.mesh, 0.0)
-        F = uem.NeoHooke(1.0, 0.3, kind="plane_strain").residual(u, v) * ufl.dx
-        for side in (1, -1):
-            F += side * push * v[1] * uem.ds(s.tag(f"outer{side}", 0, at(1, 0.45 * side)))
-        contact = uem.GeneralContact(self_contact=True, normal=normal)
-        bcs = [uem.dirichlet(V, s.tag("root", 0, at(0, -0.4)))]
-        run(uem.UnitedProblem(F, u, bcs=bcs, contacts=[contact], load={push: 4e-3}, petsc_options_prefix="soft_"), 4)
-        force = contact.force.x.array.reshape(-1, 2)[: contact._config.n_owned]
-        return COMM.allreduce(force.sum(axis=0)), COMM.allreduce(np.abs(force).sum()), highest(COMM, np.abs(u.x.array))
-
-    _, hard, far = closed(None)
-    errors = []
-    for k in (1.0, 10.0):
-        left, size, way = closed(uem.SoftContact(k))
-        assert np.abs(left).max() < 1e-13 * size
-        errors.append(abs(size / hard - 1) + abs(way / far - 1))
-    assert size > 0.005 and errors[1] < 0.25 * errors[0] < 0.25
 
 
 def test_a_block_that_rests_on_a_power_law():

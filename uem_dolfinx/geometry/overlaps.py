@@ -162,14 +162,14 @@ def _polygons(planes: Planes, contactor: Facets, target: Facets, sign: Array, de
     # counter-clockwise about the outward normal
     frame = np.where(sign[:, None, None] > 0, frame, frame[:, ::-1])
     corners, count = clip(its[:, other.ring, :2], frame)
-    doubled = np.abs(_fan(corners, count)[0].sum(axis=1))
-    found = np.flatnonzero(doubled > 2 * SLIVER * planes.size)
+    doubled = _fan(corners, count)[0].sum(axis=1)
+    found = np.flatnonzero(np.abs(doubled) > 2 * SLIVER * planes.size)
     corners, count = corners[found], count[found]
     if shape.affine and other.affine:
         polygon, first = np.nonzero(np.arange(1, corners.shape[1] - 1) < count[:, None] - 1)
         pieces = [(polygon, corners[polygon[:, None], np.column_stack([0 * first, first + 1, first + 2])])]
     else:
-        pieces = _pieces(corners, count)
+        pieces = _pieces(corners, count, doubled[found])
     parts = [(of, *_rule(piece, degree)) for of, piece in pieces]
     polygon = np.concatenate([np.repeat(of, weight.shape[1]) for of, _, weight in parts])
     at, weight = (
@@ -193,7 +193,7 @@ def _rule(piece: Array, degree: int) -> tuple[Array, Array]:
     return start + x * side + y * across + x * y * twist, area * weights
 
 
-def _pieces(corners: Array, count: Ints) -> list[tuple[Ints, Array]]:
+def _pieces(corners: Array, count: Ints, doubled: Array) -> list[tuple[Ints, Array]]:
     """Triangles and quadrilaterals of which polygons consist: numbers of polygons, and corners ``(p, 3, 2)`` and ``(p, 4, 2)``.
 
     Where functions are no polynomials, integrals depend on the pieces. If sides of facets coincide, rounding makes one corner more or less,
@@ -202,8 +202,9 @@ def _pieces(corners: Array, count: Ints) -> list[tuple[Ints, Array]]:
     Args:
         corners: in either order ``(m, k, 2)``.
         count: corners of each ``(m,)``.
+        doubled: twice the signed areas ``(m,)``.
     """
-    corners, count, polygon, cut_off = _without_small_corners(corners, count)
+    corners, count, polygon, cut_off = _without_small_corners(corners, count, doubled)
     few, many = np.flatnonzero(count <= 4), np.flatnonzero(count > 4)
     threes, fours = few[count[few] == 3], few[count[few] == 4]
     i = np.arange(corners.shape[1])
@@ -215,16 +216,15 @@ def _pieces(corners: Array, count: Ints) -> list[tuple[Ints, Array]]:
     return [(np.concatenate([polygon, threes, about]), triangles), (fours, corners[fours, :4])]
 
 
-def _without_small_corners(corners: Array, count: Ints) -> tuple[Array, Ints, Ints, Array]:
+def _without_small_corners(corners: Array, count: Ints, doubled: Array) -> tuple[Array, Ints, Ints, Array]:
     """Polygons without their small corners, their numbers of corners, and the triangles cut off with the polygons that they are of."""
     corners, count, i = corners.copy(), count.copy(), np.arange(corners.shape[1])
-    area = _fan(corners, count)[0].sum(axis=1)
     of, cut_off, left = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3, 2))], np.flatnonzero(count > 3)
     while len(left):
         some, number = corners[left], count[left]
         after = _following(some, number)
         before = some[np.arange(len(left))[:, None], np.where(i > 0, i, number[:, None]) - 1]
-        size = np.where(i < number[:, None], cross(some - before, after - some) / area[left, None], np.inf)
+        size = np.where(i < number[:, None], cross(some - before, after - some) / doubled[left, None], np.inf)
         smallest = size.argmin(axis=1)
         row = np.flatnonzero(size.min(axis=1) <= SMALL_CORNER)
         at, left = smallest[row], left[row]

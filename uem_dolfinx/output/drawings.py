@@ -33,7 +33,7 @@ BAR_ABOVE = 1.8
 #: Colour of contact forces, which viridis does not have.
 FORCE = "#d62728"
 #: Largest number of colours, as many as colour maps have. [format; colours; -]
-COLOURS = 256
+MOST_COLOURS = 256
 #: Largest side of a picture: a square of this side takes 1 GB. [bound; points; -]
 LARGEST = 2**14
 FIELD = "a scalar expression, a contact or several, or None for the size of the displacement"
@@ -61,8 +61,8 @@ class Drawing:
                 levels = given.count("levels", levels)
             elif len(levels) < 2 or not (np.diff(given.vector("levels", levels, len(levels))) > 0).all():  # type: ignore[arg-type]
                 raise InputError(given.sentence("levels", levels, "the number of colours, or two or more bounds that grow"))
-            if (levels if isinstance(levels, int) else len(levels) - 1) > COLOURS:
-                raise InputError(given.sentence("levels", levels, f"no more than {COLOURS} colours"))
+            if (levels if isinstance(levels, int) else len(levels) - 1) > MOST_COLOURS:
+                raise InputError(given.sentence("levels", levels, f"no more than {MOST_COLOURS} colours"))
             if isinstance(field, (list, tuple)) and len(field):
                 pressed = bool(given.items("field", field, lambda one: isinstance(one, Contact | ManyContacts), "a contact"))
             elif not (field is None or pressed or getattr(field, "ufl_shape", None) == ()):
